@@ -1,4 +1,4 @@
-"""What every loss asks of its inputs: shapes that belong together, bool masks, and arithmetic of at least float32."""
+"""Input checks of the losses: consistent shapes, bool masks, and arithmetic of at least float32."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -38,7 +38,7 @@ def _widened(x: object, dtype: torch.dtype) -> object:
 
 
 def check_mask(mask: Tensor) -> None:
-    """Refuse weights where a choice is asked for.
+    """Refuse weights where a bool mask is expected.
 
     Raises:
         TypeError: If the mask is not bool.

@@ -130,7 +130,7 @@ class CollinearityLoss(ResidualLoss):
     Note:
         Offsets are divided by the arm's length unless ``literal``: in metres they shrink with the depth
         (docs/decisions/09-l-shape-loss.md). The line's direction is a constant for the gradient; at the best fit its
-        own derivative drops out. The length is no constant: held, it would leave the gradient the one of the metres.
+        own derivative drops out. The length is not held constant, otherwise the gradient would be the metric error's.
     """
 
     def __init__(

@@ -43,7 +43,7 @@ def warp_to(image_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> tuple
 
 
 def _warped(image_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`warp_to`, whose valid pixels are returned apart from those that touch no hole of ``image_j``."""
+    """`warp_to` with two masks: valid pixels, and those that touch no hole of ``image_j``."""
     B, _, H, W = depth_i.shape
     v, u = torch.meshgrid(
         torch.arange(H, dtype=depth_i.dtype, device=depth_i.device),

@@ -46,13 +46,13 @@ def find_device(name: str) -> "torch.device":
 
 
 def onnx_providers(device: str) -> list[str]:
-    """What onnxruntime is asked for, the first one wanted: CUDA where it is asked for and built in, else the processor.
+    """Execution providers for onnxruntime in order of preference: CUDA if requested and available, else the CPU.
 
     Args:
         device: One of `DEVICES`; ``auto`` is CUDA if onnxruntime has it.
 
     Raises:
-        ConfigError: If the device is asked for by name and this onnxruntime does not have it.
+        ConfigError: If the device is requested by name and this onnxruntime lacks it.
     """
     check_device(device)
     if device in ("auto", "cuda") and onnxruntime_has_cuda():

@@ -17,7 +17,7 @@ OTHER_NETWORK = "other"
 DEFAULT_WEIGHTS = Path(__file__).parent / "weights" / "default.safetensors"
 SHIPPED_WEIGHTS = {name: DEFAULT_WEIGHTS.with_name(f"{name}.safetensors") for name in ("default", "broad", "near")}
 """Weights that come with the package, by name. ``broad`` has better depth in rooms never seen; maps made with it are no
-better, and some are worse. ``near`` is what a pilot looks with: what stands around it, in a unit that the map tells."""
+better, and some are worse. ``near`` is used for obstacle avoidance; the map provides its scale."""
 MAX_INPUT_PX = 2048
 """Maximum height and width; four times the training size."""
 FOCAL_RANGE = (0.05, 20.0)

@@ -37,7 +37,7 @@ class DepthModule(nn.Module):
     """
 
     def __init__(self) -> None:
-        # Torch's own takes anything: a type checker could not tell a wrong argument.
+        # Torch's own accepts anything, which hides wrong arguments from type checkers.
         super().__init__()
 
     def predict(self, x: Tensor) -> Prediction:

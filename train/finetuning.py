@@ -77,11 +77,11 @@ class Data:
         posed = [s for s in self.posed if s.usable]
         if not (self.labelled or posed):
             raise SourceError(
-                "nothing to learn from: no images with depth, and no run with two images of the same place from apart"
+                "no training data: no images with depth, and no run with two images of one place with a baseline"
             )
         for s in self.posed:
             if not s.usable:
-                logger.warning("%s: no two images of the same place from apart; it is not used", s.name)
+                logger.warning("%s: no two images of one place with a baseline; not used", s.name)
         return Data(self.labelled, posed, self.validation)
 
 
@@ -220,7 +220,7 @@ def _split(folders: Sequence[DepthFolder], keep_all: bool) -> tuple[list[Source]
 
 
 class _WithoutEvery(Sequence[View]):
-    """All views but those whose number is a multiple of ``every``, read when asked for."""
+    """All views but those whose number is a multiple of ``every``, read on access."""
 
     def __init__(self, views: Sequence[View], every: int) -> None:
         self._views, self._every = views, every

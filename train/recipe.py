@@ -1,6 +1,6 @@
 """The training recipe; `Hooks` are its extension points.
 
-A step is a function of (seed, step): no random state is carried over, so a killed run resumes exactly from its last
+A step is a function of (seed, step): no random state persists, so a killed run resumes exactly from its last
 checkpoint, and a batch split over processes is the same batch.
 """
 
@@ -229,7 +229,7 @@ def train(
         signals: What to learn from.
         config: Of the recipe.
         out: Folder, made when missing.
-        validate: Metrics of a network, asked for in process 0 alone.
+        validate: Metrics of a network; called in process 0 only.
         hooks: Called in order.
         before: Metrics of ``network`` as given. When there are any, only better weights become the best.
 
@@ -332,7 +332,7 @@ def _validation_is_due(state: TrainState, config: TrainConfig) -> bool:
 
 
 def _agree_to_stop(state: TrainState) -> None:
-    """What one process's hook asked for, in all of them: they must end after the same step."""
+    """Broadcast of one process's stop request: all must end after the same step."""
     state.stop = next(iter(everyones([state.stop] if state.stop else [])), "")
 
 

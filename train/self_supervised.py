@@ -157,7 +157,7 @@ class SelfSupervised:
         points, z = _inside(uv, view.z * scale, size, rng)
         edges, arms = straight_edges(images[0], EDGES, ARMS, ARM_POINTS, rng)
         seed = int(rng.integers(1 << 62))
-        # Both images of a pair are recoloured alike; the photometric term sees the originals.
+        # Both images of a pair get the same colour change; the photometric term sees the originals.
         inputs = [recolour(x, self.augment, np.random.default_rng(seed)) for x in images[:2]]
         focal = float(np.sqrt(K[0, 0] * K[1, 1]))
         return {

@@ -21,7 +21,7 @@ _GRID = (8, 6)
 _MIN_CHARUCO = 8
 _MIN_TAGS = 4
 _GROUPS = 5
-"""Groups of pictures that are left out in turn, to tell how well the focal length is known."""
+"""Groups of images left out in turn (jackknife) to estimate the uncertainty of the focal length."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -189,7 +189,7 @@ def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) 
         middle = float(np.median(run.trajectory.positions[:, 2]))
         low = args.min_z if args.min_z is not None else middle - 0.5
         heights = (low, args.max_z if args.max_z is not None else middle + 0.5)
-    seen, anchors, index = _seen(run, "the grid knows free space only where the camera was")
+    seen, anchors, index = _seen(run, "free space of the grid needs camera poses")
     eye_w = run.trajectory.positions[index]
     lines = SightLines(eye_w[seen.keyframe], anchors.p_w[seen.anchor].astype(float), anchors.sigma_m[seen.anchor])
     path: Path = args.out or run.path / "occupancy"

@@ -170,7 +170,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _source(args: argparse.Namespace) -> "Source":
-    """The source, or the part of a recording that was asked for."""
+    """The source, or the requested part of a recording."""
     from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.readers.source import LIVE_SCHEMES, Recording, open_source
 

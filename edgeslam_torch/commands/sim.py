@@ -107,7 +107,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _address(args: argparse.Namespace, command_port: int) -> str:
-    """How a client on this machine names it, ports only where they are not the usual ones."""
+    """Address for a client on this machine, with ports only if not the default ones."""
     host = "127.0.0.1" if args.bind == "0.0.0.0" else args.bind
     ports = (command_port, args.state_port, args.video_port)
     return f"tello://{host}" + ("" if ports == (8889, 8890, 11111) else ":{}:{}:{}".format(*ports))

@@ -26,7 +26,7 @@ class Sticks:
         self._pushed_s: float | None = None
         """Time of the last ``rc``; None while the sticks are released."""
         self._centred_s: float | None = None
-        """When they were last centred; None while they are held."""
+        """Time at which they were centred last; None while deflected."""
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._work, name="tello-sticks", daemon=True)
         self._thread.start()
@@ -39,7 +39,7 @@ class Sticks:
             self._transmit(command)
 
     def let_go(self) -> None:
-        """Centre the sticks if they were held, and stop repeating."""
+        """Centre the sticks if deflected, and stop repeating."""
         with self._lock:
             if self._pushed_s is not None:
                 self._transmit(CENTRED)

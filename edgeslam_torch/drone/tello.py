@@ -38,7 +38,7 @@ _FRESH_S = 1.0
 """Maximum age of state messages."""
 _RISEN_CM = 20.0
 _QUIET_S = 1.5
-"""Without state or pictures for this time a drone is asked for them again: after a restart it sends neither."""
+"""Time without state or frames after which they are requested again; a restarted drone sends neither."""
 _ASK_S = 1.0
 """Time between two such requests."""
 _ASK_ANSWER_S = 0.3
@@ -601,7 +601,7 @@ class Tello:
         return self._unfit()
 
     def _pictured_s(self) -> float:
-        """When the newest picture came, or pictures were first asked for; infinite before that."""
+        """Arrival of the newest frame, or the first request for video; infinite before that."""
         newest = self._video.newest if self._video is not None else None
         return max(newest.stamp_s if newest is not None else 0.0, self._video_begin_s)
 

@@ -28,7 +28,7 @@ class GStreamerCapture:
 
         Args:
             spec: ``gst:`` and a pipeline that ends in raw pictures, such as ``gst:v4l2src ! jpegdec``; an ``appsink``
-                at its end, as OpenCV wants it, is taken off.
+                at its end, as OpenCV expects it, is removed.
 
         Raises:
             SourceError: If GStreamer is not installed, or the pipeline gives no picture.
@@ -42,7 +42,7 @@ class GStreamerCapture:
         if shutil.which(_PROGRAM) is None:
             raise SourceError(f"{spec}: {_PROGRAM} is not installed (Debian: apt install gstreamer1.0-tools)")
         end = ["!", "videoconvert", "!", "video/x-raw,format=I420", "!", "y4menc", "!", "fdsink", "fd=1"]
-        self._said = tempfile.TemporaryFile()  # a pipe that nobody reads would stop a talkative pipeline  # noqa: SIM115
+        self._said = tempfile.TemporaryFile()  # an unread pipe would block a pipeline with much output  # noqa: SIM115
         self._process = subprocess.Popen(
             [_PROGRAM, "-q", *words, *end],
             stdin=subprocess.DEVNULL,

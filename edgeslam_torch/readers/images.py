@@ -29,7 +29,7 @@ _MAX_BYTES = 8 * MAX_PIXELS
 _AS_IT_IS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
 """Grey or colour of any depth, without transparency."""
 _LOOKED_AT = 50
-"""Images, spread over a recording, whose sizes tell that of the recording."""
+"""Number of images, spread over a recording, that determine its image size."""
 _JPEG = b"\xff\xd8"
 _EXIF = b"Exif\0\0"
 _COUNTER_STEP = 1000
@@ -110,7 +110,7 @@ def read_frame(entry: ImageEntry, levels: Callable[[], Levels] | None = None) ->
 
     Args:
         entry: The file and its stamp.
-        levels: The recording's, asked for when the image has more than eight bits; default: by this image alone.
+        levels: The recording's, used when the image has more than eight bits; default: by this image alone.
 
     Raises:
         SourceError: If the file is missing, empty, damaged, too large or no image.

@@ -175,9 +175,7 @@ class TelloFeed:
             remarks.append(f"{sum(refused.values())} packets from others than the drone were refused ({listing})")
         if self.tello.silences:
             times = "once" if self.tello.silences == 1 else f"{self.tello.silences} times"
-            remarks.append(
-                f"the drone fell silent {times} and was asked to go on; if it was restarted, its own axes began anew"
-            )
+            remarks.append(f"the stream stopped {times} and was requested again; a restarted drone has reset its frame")
         if self.tello.malformed:
             remarks.append(f"{self.tello.malformed} state messages could not be read")
         return remarks

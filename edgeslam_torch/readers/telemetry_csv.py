@@ -313,7 +313,7 @@ def _vertical_units(table: TelemetryTable) -> TelemetryUnits:
         axis = "down" if slope < 0 else "up"
         evidence = f"{name} changes by {slope:+.3f} m per unit*s of vgz (r = {correlation:+.2f}): {words}, z {axis}"
         return TelemetryUnits(size, slope < 0, evidence)
-    return TelemetryUnits(evidence="SDK default (dm/s, z down): too little vertical motion to tell")
+    return TelemetryUnits(evidence="SDK default (dm/s, z down): too little vertical motion to decide")
 
 
 def _height_slope(stamps_s: FloatArray, vz: FloatArray, z_m: FloatArray, step_m: float) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""A flight in rerun: where the drone is and looks, what it knows to be free and solid, its way, exits, and reasons."""
+"""Live view of a flight in rerun: pose, occupancy, path, exits and decisions."""
 
 import importlib
 import math

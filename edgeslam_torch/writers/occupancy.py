@@ -134,7 +134,7 @@ def _looked_through(seen: SightLines, resolution_m: float, z_range_m: tuple[floa
         eye_w, way = seen.eye_w[part], seen.point_w[part] - seen.eye_w[part]
         length = np.linalg.norm(way, axis=1)
         reach = length - _SIGMAS * seen.sigma_m[part] - resolution_m
-        good = np.isfinite(reach) & (reach > 0.0)  # without a sigma nobody knows how far the point is
+        good = np.isfinite(reach) & (reach > 0.0)  # without a sigma the range is unknown
         if not good.any():
             continue
         eye_w, way = eye_w[good], way[good] / length[good, None]

@@ -110,7 +110,7 @@ def summarise(
 
 
 def up_in_words(up: Up | None) -> dict[str, Any]:
-    """What tells that z is up, and how well; ``unknown`` where z is what the first camera had for up."""
+    """Source and accuracy of gravity; ``unknown`` where z is up in the first camera."""
     if up is None:
         return {"source": "unknown", "sigma_deg": None}
     off_rad = math.acos(min(1.0, float(up.direction[2])))  # nothing, but in the axes of an earlier flight

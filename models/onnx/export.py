@@ -118,7 +118,7 @@ def check_model(model: onnx.ModelProto, opset: int) -> None:
     """
     written = {o.domain: o.version for o in model.opset_import}.get("", 0)
     if written != opset:
-        raise OutputError(f"asked for opset {opset}, the exporter wrote {written}")
+        raise OutputError(f"requested opset {opset}, but the exporter wrote {written}")
     try:
         onnx.checker.check_model(model, full_check=True)
     except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:

@@ -50,7 +50,7 @@ def parse_onnx(path: Path) -> OnnxFile:
         for graph in every_graph(model):
             loops = [node.op_type for node in graph if node.op_type in LOOPS]
             if loops:
-                raise WeightsError(f"holds a {loops[0]}: nobody can tell whether it ends; export the network without")
+                raise WeightsError(f"holds a {loops[0]}: its termination is undecidable; export the network without")
         if _brought_in(model, path):
             content = model.SerializeToString()
         return OnnxFile(path, content, model)

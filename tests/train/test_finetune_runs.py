@@ -178,7 +178,7 @@ def test_run_without_a_useful_pair_is_named_and_gives_no_name(
 ) -> None:
     sequence = load_run(run_folder)
     still = replace(sequence, name="hovering", partners=[()] * len(sequence.views))
-    with pytest.raises(SourceError, match="no run with two images of the same place from apart"):
+    with pytest.raises(SourceError, match="no run with two images of one place with a baseline"):
         Data(posed=[still]).usable()
     with caplog.at_level(logging.WARNING):
         kept = Data(posed=[still, sequence]).usable()

@@ -13,7 +13,7 @@ from edgeslam_torch.errors import EdgeSlamError
 T = TypeVar("T")
 
 AHEAD = 2
-"""Batches that each worker prepares before they are asked for."""
+"""Batches that each worker prefetches."""
 
 
 class WorkerError(EdgeSlamError):

@@ -1,4 +1,4 @@
-"""Teach FastDepth what a larger depth network knows, on recordings without labels.
+"""Distil a larger depth network into FastDepth on recordings without labels.
 
 Each recording gets poses and a map by the SLAM. The teacher's depth is brought to that map view by view, by scale (or
 scale and shift, when it is relative) and smoothly near measured pixels; where the plane sweep measures depth, that

@@ -1,7 +1,7 @@
 """Many views at once as tensors, turned, zoomed and recoloured on the device that they lie on.
 
 The same virtual cameras and colours as in `augment`, a view at a time there. All chance comes from numpy's generator,
-so that the same seed asks for the same views on every device.
+so that the same seed draws the same views on every device.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""L-junctions of a pair of images, as the angle loss wants them: fixed numbers, padded with -1."""
+"""L-junctions of a pair of images, in the format of the angle loss: a fixed number, padded with -1."""
 
 import cv2
 import numpy as np

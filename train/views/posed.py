@@ -197,7 +197,7 @@ def _pose(row: FloatArray) -> FloatArray:
 
 
 def _trusted_stamps(folder: Path) -> set[float] | None:
-    """Stamps of the largest piece's frames whose final pose rests on the map; None where no table tells."""
+    """Stamps of the largest submap's tracked frames; None without a status table."""
     rows = read_status(folder / "status.csv")
     if not rows:
         return None

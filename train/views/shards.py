@@ -38,7 +38,7 @@ DEPTHS = ("depth.png", "depth.npy")
 DEPTH_PER_M = 1000.0
 """Of a depth.png whose json says nothing else."""
 TAIL = 64
-"""Bytes at the end of each file that tell changed content [bytes]."""
+"""Number of bytes at the end of each file that are compared to detect changes."""
 _UNREADABLE = (OSError, ValueError, IndexError, OverflowError, MemoryError, RecursionError, cv2.error)
 PER_SHARD = 1000
 """Samples in a file that `write_shards` writes; about 200 MB."""
@@ -61,7 +61,7 @@ class _Sample:
 
 
 class ShardedViews(Sequence[View]):
-    """Views of tar files, read and decoded when asked for; nothing is kept.
+    """Views of tar files, read and decoded on access; nothing is cached.
 
     Args:
         samples: Where they lie.

@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--perception",
         choices=("truth", "slam"),
         default="truth",
-        help="what their pilot is told: the true pose and depth (default), or what the SLAM knows",
+        help="source of the planner's states: true pose and depth (default), or the SLAM",
     )
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="of those flights at a time (default: 1)")
     parser.add_argument("--no-micro", action="store_true", help="omit the times of solver and depth network")

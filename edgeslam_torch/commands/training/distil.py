@@ -1,4 +1,4 @@
-"""``edgeslam distil``: teach FastDepth what a larger depth network knows."""
+"""``edgeslam distil``: distil a larger depth network into FastDepth."""
 
 import argparse
 import os
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from edgeslam_torch.train.recipe import Hooks, TrainConfig
     from edgeslam_torch.train.result import TrainingResult
 
-HELP = "teach a drone-sized network what a larger depth network knows, on recordings without labels"
+HELP = "distil a larger depth network into a drone-sized one, on recordings without labels"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

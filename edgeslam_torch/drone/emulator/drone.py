@@ -165,7 +165,7 @@ class DroneModel:
         self._finish()
 
     def _step_velocity(self, dt: float) -> None:
-        """Lean towards the wanted velocity; the air does the rest. The controller knows its drag, not the wind."""
+        """Tilt towards the commanded velocity. The controller compensates drag, not wind."""
         wanted = (self._wanted_velocity() - self.velocity) / _TAU_S
         wanted = np.clip(wanted + DRAG_PER_S * self.velocity, -_MAX_LEAN_M_S2, _MAX_LEAN_M_S2)
         self.lean_m_s2 = self.lean_m_s2 + (1.0 - math.exp(-dt / _LEAN_S)) * (wanted[:2] - self.lean_m_s2)

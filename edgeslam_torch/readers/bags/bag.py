@@ -20,7 +20,7 @@ METADATA = "metadata.yaml"
 _UNFINISHED = ".active"
 """What a recorder appends to the name while it writes."""
 _MAX_GAP_S, _MAX_OVERLAP_S = 10.0, 1.0
-"""Between the files that a recorder split: writers leave tenths of a second, other recordings lie minutes apart."""
+"""Maximum gap between files of a split recording: recorders leave tenths of a second, separate recordings minutes."""
 _DAMAGED = (
     OSError,
     ValueError,
@@ -148,7 +148,7 @@ class Bag:
             return read(raw.data, kind)
 
     def _store(self, topic: str) -> Any:
-        """Type store that knows the topic's type: the bag's own definition, else ROS's."""
+        """Type store with the topic's type: the bag's own definition, else ROS's."""
         kind, definition, is_ros1 = self._definitions[topic]
         if kind in self._stores:
             return self._stores[kind]

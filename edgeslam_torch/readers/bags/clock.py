@@ -11,9 +11,9 @@ _OTHER_CLOCK_S = 5.0
 """Difference between header and receipt that no network explains."""
 _EPOCH_S = 86400.0
 _BACK_S = 1.0
-"""Messages that come in the wrong order are that far apart at most; a clock that was set is further."""
+"""Maximum step back of messages out of order; larger steps mean that the clock was set."""
 _SLACK_S, _SLACK = 2.0, 4.0
-"""A header's step is believed up to this much, and this many times the step of the receipt."""
+"""A header's step is accepted up to this value and this multiple of the step of the receipt times."""
 
 
 def header_s(message: Any) -> float | None:

@@ -9,7 +9,7 @@ from edgeslam_torch.types import FloatArray
 _SPAN_S = 0.4
 """Time over which positions are compared with velocities."""
 _MIN_WAY_M = 0.5
-"""Shorter ways tell nothing."""
+"""Minimum path length."""
 _DECISIVE = 0.25
 """Ratio of squared errors below which the positions refute the definition."""
 

@@ -14,7 +14,7 @@ from edgeslam_torch.readers.bags.odometry import Motion, motion_of_odometry
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
 _EVERY_S = 0.045
-"""Samples are at least so far apart: a Tello sends one in 0.1 s, and more help nobody."""
+"""Minimum interval between samples; a Tello sends 10 Hz, and a higher rate has no benefit."""
 _HOLD_S = 0.25
 """Age up to which another topic's last message still describes the moment."""
 _WORLD_FRAMES = ("map", "odom", "world", "earth", "local_origin", "enu")
@@ -31,7 +31,7 @@ def read_bag_telemetry(
     Args:
         bag: The recording.
         topics: Role to topic.
-        asked: Roles that the user named; they go before others.
+        asked: Roles that the user named; they take precedence.
         clocks: Topic to its clock.
     """
     roles = {name: role for role, name in topics.items()}

@@ -70,48 +70,50 @@ def choose(bag: Bag, wanted: Sequence[str] = ()) -> Choice:
     Raises:
         SourceError: If a topic does not exist or cannot be what it was given for, or the camera is not clear.
     """
-    wishes = _wishes(bag, wanted)
-    image = _image(bag, wishes.get(IMAGE))
-    telemetry, remarks = _telemetry(bag, wishes)
-    asked = frozenset(role for role, name in wishes.items() if name != _NOTHING)
+    requests = _requests(bag, wanted)
+    image = _image(bag, requests.get(IMAGE))
+    telemetry, remarks = _telemetry(bag, requests)
+    asked = frozenset(role for role, name in requests.items() if name != _NOTHING)
     if depth_of(bag, next(topic for topic in bag.topics if topic.name == image)) == THERMAL:
         remarks.append(
-            f"{image}: {THERMAL} is read as 16-bit pictures, since the topic was named; depth maps look alike"
+            f"{image}: {THERMAL} is read as 16-bit pictures, since the topic was named; depth maps have the same format"
         )
-    return Choice(image, _camera(bag, image, wishes.get(CAMERA)), telemetry, asked, tuple(remarks))
+    return Choice(image, _camera(bag, image, requests.get(CAMERA)), telemetry, asked, tuple(remarks))
 
 
-def _wishes(bag: Bag, wanted: Sequence[str]) -> dict[str, str]:
+def _requests(bag: Bag, wanted: Sequence[str]) -> dict[str, str]:
     topics = {topic.name: topic for topic in bag.topics}
-    wishes: dict[str, str] = {}
-    for wish in wanted:
-        role, equals, name = wish.rpartition("=")
+    requests: dict[str, str] = {}
+    for request in wanted:
+        role, equals, name = request.rpartition("=")
         if equals and role not in (IMAGE, CAMERA, *TELEMETRY):
-            raise SourceError(f"--topic {wish}: no role {role!r}; there are {', '.join((IMAGE, CAMERA, *TELEMETRY))}")
+            raise SourceError(
+                f"--topic {request}: no role {role!r}; there are {', '.join((IMAGE, CAMERA, *TELEMETRY))}"
+            )
         if equals and name == _NOTHING and role != IMAGE:
-            wishes[role] = _NOTHING
+            requests[role] = _NOTHING
             continue
         if name not in topics:
             close = difflib.get_close_matches(name, topics, n=1, cutoff=0.5)
             hint = f"did you mean {close[0]}?" if close else f"list them with: edgeslam topics {bag.path}"
-            raise SourceError(f"--topic {wish}: {bag.path.name} has no topic {name!r}; {hint}")
+            raise SourceError(f"--topic {request}: {bag.path.name} has no topic {name!r}; {hint}")
         can_be = role_of(topics[name])
         if can_be is None or (equals and can_be != role):
             what = f"a {role} topic" if equals else "of a type that is used"
-            raise SourceError(f"--topic {wish}: {topics[name].kind} is not {what}; see edgeslam topics {bag.path}")
-        if can_be in wishes:
-            raise SourceError(f"--topic {wish}: {wishes[can_be]} was given as {can_be} already; give one")
-        wishes[can_be] = name
-    return wishes
+            raise SourceError(f"--topic {request}: {topics[name].kind} is not {what}; see edgeslam topics {bag.path}")
+        if can_be in requests:
+            raise SourceError(f"--topic {request}: {requests[can_be]} was given as {can_be} already; give one")
+        requests[can_be] = name
+    return requests
 
 
-def _image(bag: Bag, wish: str | None) -> str:
+def _image(bag: Bag, request: str | None) -> str:
     candidates = [topic for topic in bag.topics if role_of(topic) == IMAGE]
-    if wish is not None:
-        form = depth_of(bag, next(topic for topic in candidates if topic.name == wish))
+    if request is not None:
+        form = depth_of(bag, next(topic for topic in candidates if topic.name == request))
         if form not in (None, THERMAL):
-            raise SourceError(f"--topic {wish}: depth maps ({form}), not a camera's pictures")
-        return wish
+            raise SourceError(f"--topic {request}: depth maps ({form}), not a camera's pictures")
+        return request
     filled = [topic for topic in candidates if topic.count]
     forms = {topic.name: depth_of(bag, topic) for topic in filled}
     cameras = {name for name, form in forms.items() if form is None}
@@ -136,10 +138,10 @@ def _raw(name: str) -> str:
     return name.removesuffix(_COMPRESSED)
 
 
-def _camera(bag: Bag, image: str, wish: str | None) -> str | None:
+def _camera(bag: Bag, image: str, request: str | None) -> str | None:
     """The ``CameraInfo`` beside the pictures; with one camera in the bag, the only one there is."""
-    if wish is not None:
-        return None if wish == _NOTHING else wish
+    if request is not None:
+        return None if request == _NOTHING else request
     infos = [topic.name for topic in bag.topics if role_of(topic) == CAMERA and topic.count]
     beside = _raw(image).rpartition("/")[0] + "/camera_info"
     if beside in infos:
@@ -148,14 +150,14 @@ def _camera(bag: Bag, image: str, wish: str | None) -> str | None:
     return infos[0] if len(infos) == 1 and len(cameras) == 1 else None
 
 
-def _telemetry(bag: Bag, wishes: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
+def _telemetry(bag: Bag, requests: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
     """Topic of each role, and what is not used because there are several."""
     chosen: dict[str, str] = {}
     remarks = []
     for role in TELEMETRY:
-        if role in wishes:
-            if wishes[role] != _NOTHING:
-                chosen[role] = wishes[role]
+        if role in requests:
+            if requests[role] != _NOTHING:
+                chosen[role] = requests[role]
             continue
         names = [topic.name for topic in bag.topics if role_of(topic) == role and topic.count]
         if len(names) == 1:

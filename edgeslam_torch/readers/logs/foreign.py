@@ -42,7 +42,7 @@ def foreign_log(path: Path) -> str | None:
         return f"{what}, and make a table with the {_NEEDED}"
     text = head.decode("utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8", errors="replace")
     if _SRT.match(text):
-        return f"subtitles of a DJI video (SRT): they tell no velocities of this rate; make a table with the {_NEEDED}"
+        return f"subtitles of a DJI video (SRT): they hold no velocities at this rate; make a table with the {_NEEDED}"
     first = text.lstrip("\ufeff").split("\n", 1)[0]
     found = next((what for pattern, what in _HEADERS if pattern.search(first)), None)
     return None if found is None else f"{found} velocities, attitude and height to a table with the {_NEEDED}"

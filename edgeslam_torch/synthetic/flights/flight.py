@@ -29,7 +29,7 @@ _AROUND_M = 0.8
 _CORNER_SPEED = 0.6
 """Share of the speed around it: a turn of 90 degrees at 28 degrees a second."""
 CORNER_M = 0.1
-"""Maximum cut of the polyline's corners at usual speeds; added to the clearance of its legs."""
+"""Maximum cut of the polyline's corners at nominal speeds; added to the clearance of its legs."""
 
 
 @dataclass(frozen=True, slots=True)

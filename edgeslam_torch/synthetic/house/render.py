@@ -106,7 +106,7 @@ def _project(world: World, camera: Camera, T_w_c: FloatArray) -> list[_Polygon]:
     side = np.einsum("qi,qi->q", world.normals_w, T_w_c[:3, 3] - world.corners_w[:, 0])
     corners = world.corners_w @ T_c_w[:3, :3].T + T_c_w[:3, 3]  # (Q, 4, 3)
     x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
-    # A quad is out of sight when all its corners are beyond the same side of the viewing pyramid.
+    # A quad is invisible when all its corners are beyond the same side of the viewing pyramid.
     left, right = (-0.5 - camera.cx) / camera.fx, (camera.width - 0.5 - camera.cx) / camera.fx
     top, bottom = (-0.5 - camera.cy) / camera.fy, (camera.height - 0.5 - camera.cy) / camera.fy
     outside = [(x < left * z), (x > right * z), (y < top * z), (y > bottom * z), z < NEAR_M]

@@ -125,7 +125,7 @@ def _room_wall(scene: Scene, place: Place, length: float, rng: Rng, height_m: fl
 
 
 def _along_rectangle(half: FloatArray, spacing_m: float) -> Iterator[tuple[float, float]]:
-    """Places at most so far apart along the four sides of a rectangle around the origin, corners included."""
+    """Points along the sides of a rectangle around the origin with at most this spacing, corners included."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
     for here, there in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         count = int(np.ceil(np.linalg.norm(there - here) / spacing_m))

@@ -25,7 +25,7 @@ class TrueExit:
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A world to fly in, and what a judge knows about it. The world's floor is at z = 0."""
+    """A world with its ground truth. The floor is at z = 0."""
 
     name: str
     seed: int
