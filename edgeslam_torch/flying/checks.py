@@ -24,7 +24,7 @@ def check_fit(allow_motion: bool, battery: float, limits: NavLimits, guessed_cam
         raise FlightRefused(NO_FLY)
     if guessed_camera:
         raise FlightRefused(
-            "this camera is not calibrated, so the scale is not metric: give --camera FILE "
+            "no calibration of this camera, so the scale is not metric: give --camera FILE "
             "(make one with: edgeslam calibrate)"
         )
     if battery <= limits.home_battery:

@@ -17,7 +17,7 @@ def test_a_dry_run_shows_the_plan_and_asks_nobody(capsys):
     assert "nothing was sent" in out
 
 
-@pytest.mark.parametrize(("verb", "words"), [("corridor", "where it ends or opens"), ("exit", "fly through it")])
+@pytest.mark.parametrize(("verb", "words"), [("corridor", "until it ends or opens"), ("exit", "fly through it")])
 def test_verbs_that_look_for_openings_say_so(verb, words, capsys):
     assert main(["fly", verb, "40", "--dry-run"]) == 0
     out = capsys.readouterr().out
@@ -33,7 +33,7 @@ def test_without_leave_nothing_moves(capsys):
     ("arguments", "words"),
     [
         (["goto", "50", "0"], "fence is at 30.0 m"),
-        (["goto", "3", "0", "5"], "height of flight must be 0.5 to 1.9 m"),
+        (["goto", "3", "0", "5"], "flight height must be 0.5 to 1.9 m"),
         (["goto", "3", "0", "1", "--height", "1.2"], "given twice"),
         (["goto", "3", "0", "--speed", "3"], "--speed must be 0.05 to 1 m/s"),
         (["goto", "3", "0", "--fence", "-1"], "--fence must be positive"),

@@ -229,7 +229,7 @@ def test_occupancy_needs_metres(run_folder: Callable[..., Path], tmp_path: Path)
 
 
 @pytest.mark.parametrize("up", [None, {"source": "unknown", "sigma_deg": None}])
-def test_occupancy_of_a_map_that_may_be_tilted_is_refused_unless_told(
+def test_occupancy_of_a_possibly_tilted_map_needs_an_option(
     up: dict[str, object] | None, run_folder: Callable[..., Path], tmp_path: Path
 ) -> None:
     run_folder(tmp_path / "a")

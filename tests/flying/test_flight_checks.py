@@ -28,7 +28,7 @@ def walled():
         ("there", "three numbers"),
         ((4.0, 3.1, 1.15), "fence"),
         ((1.0, 0.0, 1.8), "high"),
-        ((2.05, 0.3, 1.15), "solid"),
+        ((2.05, 0.3, 1.15), "obstacle"),
     ],
 )
 def test_goals_that_make_no_sense(goal, words):

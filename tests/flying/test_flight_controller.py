@@ -18,7 +18,7 @@ AHEAD = VelocityCommand(forward_m_s=0.4, why="ahead")
 
 
 class Steady:
-    """A pilot that wants one thing, or hangs."""
+    """A planner with one command, or one that hangs."""
 
     def __init__(self, command=AHEAD):
         self.command, self.phase, self.layer, self.task = command, Phase.FLYING, None, None

@@ -1,4 +1,4 @@
-"""A planner's record holds exactly what it saw and decided, survives a crash, and asks a new planner the same."""
+"""A planner's record is exact, survives a crash, and replays in a new planner."""
 
 import base64
 import json
@@ -40,7 +40,7 @@ def state(now_s, p, v=(0.0, 0.0, 0.0), yaw=0.0):
 
 
 def fly(path, seconds, held_x=math.inf):
-    """A drone that follows every command, until a pane that nobody sees holds it, recorded."""
+    """Record of a drone that follows every command until an invisible pane stops it."""
     log = PlanLog(path / PLAN, NavLimits())
     flight_controller = FlightController(NavLimits(), witness=log.add)
     flight_controller.begin(GoTo(np.array([1.5, 0.2, 1.15])))
@@ -154,10 +154,10 @@ def _array(shape) -> bytes:
     [
         (lambda lines: [lines[0], lines[1], b"{half a line\n", *lines[2:]], "line 3 is damaged"),
         (lambda lines: [b'{"format": "soup"}\n', *lines[1:]], "not a planner's record"),
-        (lambda lines: [lines[0].replace(b"1", b"9"), *lines[1:]], "version 9 is not known"),
-        (lambda lines: [lines[0], b'{"kind": "os:system"}\n'], "os:system is not known"),
-        (lambda lines: [lines[0], b'{"kind": "edgeslam_torch.config:SlamConfig"}\n'], "SlamConfig is not known"),
-        (lambda lines: [lines[0], lines[1], lines[2].replace(b"GoTo", b"GoBy"), *lines[3:]], "GoBy is not known"),
+        (lambda lines: [lines[0].replace(b"1", b"9"), *lines[1:]], "version 9 is not supported"),
+        (lambda lines: [lines[0], b'{"kind": "os:system"}\n'], "os:system is unknown"),
+        (lambda lines: [lines[0], b'{"kind": "edgeslam_torch.config:SlamConfig"}\n'], "SlamConfig is unknown"),
+        (lambda lines: [lines[0], lines[1], lines[2].replace(b"GoTo", b"GoBy"), *lines[3:]], "GoBy is unknown"),
         (lambda lines: [lines[0], *lines[3:]], "does not begin with the flight's limits"),
         (lambda lines: [lines[0], _array(shape=[3])], "line 2 is damaged"),
         (lambda lines: [lines[0], _array(shape=[10**12])], "line 2 is damaged"),
@@ -193,7 +193,7 @@ def test_a_task_that_no_file_can_hold_is_said(tmp_path):
     with pytest.raises(OutputError, match="cannot hold a set"):
         log.add(NewTask(GoTo({1})))
     log.close()
-    with pytest.raises(SourceError, match="never saw"):
+    with pytest.raises(SourceError, match="holds no state"):
         replay(tmp_path)
 
 

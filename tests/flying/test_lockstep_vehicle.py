@@ -38,7 +38,7 @@ class Truth:
 
 @pytest.fixture(autouse=True)
 def knowing(monkeypatch):
-    """Eyes that know, and pictures that cost nothing."""
+    """Ground truth perception and empty images."""
     drone_at = lockstep_vehicle.drone_at
 
     def unpainted(*arguments):

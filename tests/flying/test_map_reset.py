@@ -1,4 +1,4 @@
-"""When a map that tells no metres is given up, and where the next one begins."""
+"""Reset of a map without certain scale, and start pose of the next one."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def test_up_and_down_is_no_way():
     assert due(flown(climbs), 60.0) is not None
 
 
-def test_it_begins_where_velocities_carried_it_in_axes_of_the_first_heading():
+def test_start_pose_is_dead_reckoned_in_axes_of_the_first_heading():
     """Half a metre along where it looks at first, a third to its left, then half a turn to the left."""
     yaw = np.deg2rad(50.0)
     ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])

@@ -21,7 +21,7 @@ WALL_M = 4.0
 
 
 class ObedientVehicle:
-    """Moves at once as told, before a wall at x = `WALL_M` that it sees when it looks there; free elsewhere.
+    """Follows commands at once, in front of a wall at x = `WALL_M` that it sees when it looks there; free elsewhere.
 
     ``door``: the wall is at 2.5 m, from -2 to 2, with a doorway of 0.9 m, and behind it is another at `WALL_M` + 2.
     """
@@ -141,13 +141,13 @@ def test_there_and_back_with_outcomes():
 def test_goals_in_the_wall_are_refused_and_it_stays_in_the_air():
     with navigator() as nav:
         nav.take_off()
-        with pytest.raises(FlightRefused, match="solid"):
+        with pytest.raises(FlightRefused, match="obstacle"):
             nav.go_to((WALL_M + 0.05, 0.0, 1.15))
         assert nav.vehicle.flying
     assert nav.vehicle.over == "the program left"
 
 
-def test_goals_before_metres_are_refused_and_no_metres_end_in_a_landing():
+def test_without_metric_scale_goals_are_refused_and_take_off_lands():
     with navigator(metric=False) as nav:
         nav.vehicle.take_off()
         nav.flight_controller.order(DroneState(0.0, nav.vehicle.p, 0.0, np.zeros(3), metric=False))

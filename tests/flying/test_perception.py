@@ -1,4 +1,4 @@
-"""What a pilot is told of a picture that has no place in the map."""
+"""Views and states of the SLAM perception."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ DISTANCE_M = 1.5
 
 
 def a_map(points, edges=None, fresh=None):
-    """A SLAM that knows points ``(N, 3)`` and edges, and is told pixels and depths of the newest picture's edges."""
+    """A SLAM with points ``(N, 3)`` and edges, and given pixels and depths of the newest frame's edges."""
     none = np.zeros((0, 2)), np.zeros(0)
     return SimpleNamespace(
         surroundings=lambda: (points, np.zeros((0, 3)) if edges is None else edges),
@@ -108,7 +108,7 @@ def test_edges_of_the_map_stand_before_what_the_network_sees(perception):
 
 
 def test_edges_of_the_newest_picture_stand_before_what_the_network_sees(perception):
-    """Before a keyframe confirms them; asked for in published units, of half a metre here."""
+    """Before a keyframe confirms them; requested in output units, here of half a metre."""
     asked = []
 
     def fresh(image, nearest, farthest):
@@ -157,8 +157,8 @@ def test_the_dark_is_no_wall(perception):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_what_lies_behind_a_door_is_told_from_before_it(seed):
-    """The default weights tell a wall there, at .53 to .61 of the distance."""
+def test_depth_behind_a_door_is_separate_from_the_wall(seed):
+    """The default weights predict a wall there, at 0.53 to 0.61 of the distance."""
     site = named_site("corridor", seed)
     door, camera = site.exits[0], CAMERA.scaled(240, 180)
     T_w_b = np.eye(4)
@@ -191,7 +191,7 @@ def test_a_network_contradicts_nothing_that_velocities_and_heights_confirm(used,
     assert _contradicted(health) == contradicted
 
 
-def test_a_pilot_hears_how_old_views_moved_too(perception):
+def test_corrections_include_thinned_views(perception):
     """Of those that it keeps no longer one in two seconds."""
     poses = np.repeat(np.eye(4)[None], 2000, axis=0)
     for k in range(600):
@@ -207,7 +207,7 @@ def test_a_pilot_hears_how_old_views_moved_too(perception):
     assert [T[0, 3] for picture, T in perception._thinned_views if picture < 100] == [1.0] * 4
 
 
-def test_a_doubtful_metre_is_told(perception):
+def test_scale_in_doubt_raises_its_sigma(perception):
     """By the SLAM's own sources it is sure to 2 %."""
     sure = ScaleEstimate(1.0, 0.02, "telemetry")
     health = SimpleNamespace(state="tracking", scale=sure, sources=(), submap_sigma=0.0, drift_sigma=0.0, metric=True)
@@ -220,7 +220,7 @@ def test_a_doubtful_metre_is_told(perception):
 
 
 class Slam:
-    """One that has no metres but the network's, and remembers what it was given."""
+    """A SLAM with the network's scale only, which records its inputs."""
 
     made: ClassVar[list] = []
 

@@ -51,7 +51,7 @@ def test_a_drone_that_cannot_turn_is_home_all_the_same():
 
 @pytest.mark.parametrize("turns", [-1, 1, 2])
 def test_a_drone_that_has_turned_round_looks_ahead_all_the_same(turns):
-    """Its heading is told without jumps: 360 degrees are ahead."""
+    """The heading is unwrapped: 360 degrees are ahead."""
     task = way_home()
     for stamp_s in (0.0, 2.0, 4.0):
         task.heading_rad(at(stamp_s, x=0.4, yaw_deg=360.0 * turns + 2.0))

@@ -1,4 +1,4 @@
-"""The threads of a flight over UDP, against an emulator whose true state the perception tell."""
+"""Threads of a flight over UDP, against an emulator with ground truth perception."""
 
 import os
 import signal
@@ -52,7 +52,7 @@ class Truth:
 
 
 class Steady:
-    """A pilot that wants one thing, or hangs."""
+    """A planner with one command, or one that hangs."""
 
     def __init__(self):
         self.command, self.phase, self.layer, self.task = VelocityCommand(forward_m_s=0.3), Phase.FLYING, None, None
@@ -69,7 +69,7 @@ class Steady:
 
 @pytest.fixture
 def flight(monkeypatch):
-    """An emulator, and a navigator whose pilot wants to go ahead."""
+    """An emulator, and a navigator whose planner commands forward flight."""
     monkeypatch.setattr(udp_vehicle, "SlamPerception", Truth)
     monkeypatch.setattr(Truth, "battery", 1.0)
     monkeypatch.setattr(Truth, "tracked", True)

@@ -1,4 +1,4 @@
-"""Glimpses through a wall, against pictures of a wall whose opening is known."""
+"""Aperture hypotheses against images of a wall with a known opening."""
 
 import math
 
@@ -43,7 +43,7 @@ def picture(T_w_c, opening, behind_m, wall_x=2.0):
 
 
 def walls(opening=(-0.45, 0.45), free_beyond=False, shut=0.0):
-    """What a grid knows: a wall across x whose opening is not carved, free before it."""
+    """A grid with a wall across x whose opening is unknown, and free space in front."""
     x, y = np.meshgrid((np.arange(120) + 0.5) * 0.1 - 6.0, (np.arange(120) + 0.5) * 0.1 - 6.0, indexing="ij")
     upright = (np.abs(x - 2.0) < 0.1) & (np.abs(y) < 3.0) & ~((y > opening[0]) & (y < opening[1]))
     inside = (np.abs(x - 2.0) < 0.1) & (y > opening[0]) & (y < opening[1])
@@ -57,7 +57,7 @@ def seen(known, view, here=(0.0, 0.0)):
 
 
 @pytest.mark.parametrize(("x", "y", "yaw_deg"), [(0.5, 0.0, 0.0), (0.8, -0.6, 30.0), (0.3, 1.2, -40.0)])
-def test_a_door_is_glimpsed_although_nothing_behind_it_is_known_to_be_free(x, y, yaw_deg):
+def test_door_is_a_hypothesis_before_free_space_confirms_it(x, y, yaw_deg):
     T = looking(x, y, math.radians(yaw_deg))
     (gap,) = seen(walls(), picture(T, (-0.45, 0.45), 2.0), (x, y))
     assert gap.centre_w == pytest.approx([2.0, 0.0], abs=0.12)
@@ -76,12 +76,12 @@ def test_a_door_is_glimpsed_although_nothing_behind_it_is_known_to_be_free(x, y,
         ("through a third of it", walls(), (0.15, 0.45), 2.0),
     ],
 )
-def test_what_is_no_glimpse(case, known, opening, behind_m):
+def test_closed_openings_yield_no_hypothesis(case, known, opening, behind_m):
     T = looking(0.5, 0.0, 0.0)
     assert seen(known, picture(T, opening, behind_m)) == [], case
 
 
-def test_what_is_behind_the_camera_or_far_away_is_not_glimpsed():
+def test_no_hypothesis_behind_the_camera_or_far_away():
     assert seen(walls(), picture(looking(0.5, 0.0, math.pi), (-0.45, 0.45), 2.0)) == []
     far = looking(-2.5, 0.0, 0.0)
     assert seen(walls(), picture(far, (-0.45, 0.45), 2.0), (-2.5, 0.0)) == []
@@ -95,7 +95,7 @@ def test_a_camera_that_looks_at_the_floor_has_no_level_ray(tilt_deg):
     assert seen(walls(), picture(T, (-0.45, 0.45), 2.0)) == []
 
 
-def test_two_glimpses_are_a_candidate_and_no_exit():
+def test_two_hypotheses_make_a_candidate_but_no_exit():
     watch, T = ExitTracker(), looking(0.5, 0.0, 0.0)
     view = picture(T, (-0.45, 0.45), 2.0)
     for k in range(4):
@@ -112,7 +112,7 @@ def test_two_glimpses_are_a_candidate_and_no_exit():
     assert watch.candidates == (), "it is one now"
 
 
-def test_what_was_glimpsed_goes_along_with_the_map():
+def test_hypotheses_follow_map_corrections():
     watch, T = ExitTracker(), looking(0.5, 0.0, 0.0)
     for k in range(3):
         here = np.array([0.5, 0.0, HEIGHT_M])

@@ -32,7 +32,7 @@ def asked(looks, x, now_s=0.0, layer=CORRIDOR):
 
 
 def looked(looks, x, yaw_deg=0.0, begin_s=0.0, seconds=20.0, turns=True):
-    """Headings [degrees] that a drone has which turns by 60 degrees a second to where it is asked to look."""
+    """Headings [degrees] of a drone that follows the requested headings at 60 deg/s."""
     seen = []
     asked(looks, x, begin_s)
     for k in range(round(20 * seconds)):
@@ -45,14 +45,14 @@ def looked(looks, x, yaw_deg=0.0, begin_s=0.0, seconds=20.0, turns=True):
     return seen
 
 
-def test_it_looks_at_both_walls_beside_it_from_before():
+def test_walls_on_both_sides_are_viewed_frontally():
     seen = np.array(looked(LooksAround(), 2.0))
     for side in (1.0, -1.0):
         assert (np.abs(side * seen - 90.0) < 8.0).any(), "a door beside the corridor comes to the picture's middle"
     assert len(seen) < 20 * 10, "in less than ten seconds"
 
 
-def test_what_it_has_looked_at_is_not_looked_at_again():
+def test_covered_borders_are_not_viewed_again():
     looks = LooksAround()
     assert looked(looks, 2.0)
     looks.goals(CORRIDOR, at(30.0, 2.0, 0.0))
@@ -62,7 +62,7 @@ def test_what_it_has_looked_at_is_not_looked_at_again():
     assert not looked(looks, 2.1, begin_s=40.0), "and there it does not stand again"
 
 
-def test_it_is_sent_to_where_most_is_left_until_all_is_looked_at():
+def test_viewpoints_cover_all_borders_greedily():
     looks, x, stands = LooksAround(), 0.0, 0
     for k in range(20):
         looked(looks, x, begin_s=30.0 * k)
@@ -85,7 +85,7 @@ def test_a_view_ahead_alone_is_looked_at_only_if_there_is_a_doors_width_of_it():
     assert looks.heading_rad(at(0.2, 2.0, 0.0)) is None, "all is nearer than a door fits into a picture"
 
 
-def test_where_a_look_showed_nothing_it_is_not_sent_once_more():
+def test_viewpoint_without_success_is_not_repeated():
     looks = LooksAround()
     best = asked(looks, 2.0)[0]
     looked(looks, float(best[0]), turns=False)
@@ -109,7 +109,7 @@ def test_a_lost_pose_and_a_drone_that_does_not_turn_end_it():
     assert len(looked(LooksAround(), 2.0, seconds=20.0, turns=False)) == pytest.approx(320, abs=2)
 
 
-def test_places_go_along_with_the_map():
+def test_positions_follow_map_corrections():
     """Metres become twice as long: where it has looked around, 2 m from its take-off, is 4 m from it."""
     looks = LooksAround()
     assert looked(looks, 2.0)

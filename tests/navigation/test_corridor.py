@@ -26,13 +26,13 @@ def state(x, y=0.0, stamp_s=0.0, yaw=0.0):
 
 
 def place(task, layer, at):
-    """Where it wants to go ``(2,)``."""
+    """Goal ``(2,)``."""
     (cell,) = task.goals(layer, at)
     return layer.centres(cell)
 
 
 def follow(task, layer, *way):
-    """Where it wants to go at the end of a way."""
+    """Goal at the end of a path."""
     for k, (x, y) in enumerate(way[:-1]):
         task.goals(layer, state(x, y, 0.5 * k))
     return place(task, layer, state(*way[-1], 0.5 * len(way)))
@@ -78,7 +78,7 @@ def test_a_drone_that_flies_aslant_goes_on_along_the_walls():
     assert last == pytest.approx([4.4, 0.0], abs=0.2)
 
 
-def test_what_is_unseen_behind_the_start_is_where_it_came_from():
+def test_unknown_space_behind_the_start_is_ignored():
     """Two metres behind it, which is not beside its way: at the end of the corridor it does not turn back to it."""
     layer = seen(lambda x, y: (np.abs(y) > 1.0) | (x > 4.0), lambda x, y: x < -2.0)
     task = FollowCorridor()
@@ -87,7 +87,7 @@ def test_what_is_unseen_behind_the_start_is_where_it_came_from():
 
 
 @pytest.mark.parametrize("width", [2.0, 2.4])
-def test_the_corridor_flown_along_one_side_is_no_way_on(width):
+def test_corridor_flown_along_one_side_is_no_continuation(width):
     layer = seen(sides(width), lambda x, y: np.abs(y - 0.5 * width + 0.1) < 0.1)
     way = [(x, 0.6 - 0.5 * width) for x in np.arange(-4.0, 4.7, 0.4)]
     task = FollowCorridor()
@@ -96,7 +96,7 @@ def test_the_corridor_flown_along_one_side_is_no_way_on(width):
     assert len(found) == 0, "a turn on the spot at the end"
 
 
-def test_an_end_is_something_solid_ahead_not_the_lack_of_a_way():
+def test_end_needs_an_obstacle_ahead():
     """At 1 m before the end with a door in its middle; in the middle of it; where the sides alone are near."""
     task = FollowCorridor()
     ending = seen(with_door(0.9))
@@ -111,7 +111,7 @@ def test_a_door_is_no_corridor():
     assert place(FollowCorridor(), seen(with_door(0.9)), state(0.0))[0] < 1.9
 
 
-def test_what_is_narrow_straight_ahead_is_flown_through_unless_it_is_a_door():
+def test_narrow_space_ahead_is_entered_unless_it_is_a_door():
     """Depth that is too near makes a corridor as narrow as a door for half a metre."""
     narrow = seen(lambda x, y: sides()(x, y) | (np.abs(x - 2.0) < 0.3) & (np.abs(y) > 0.4))
     way = [(x, 0.0) for x in (-1.0, -0.5, 0.0, 0.5, 1.0, 1.3)]
@@ -127,21 +127,21 @@ def test_what_is_narrow_straight_ahead_is_flown_through_unless_it_is_a_door():
     assert follow(task, narrow, *[(x, 0.0) for x in (-1.0, -0.5, 0.0, 0.5)], (1.0, 0.0))[0] < 1.8
 
 
-def test_a_speck_beside_the_start_does_not_end_it():
-    """`blank_walls` 812: what is wide and free begins farther than a metre away."""
+def test_noise_beside_the_start_does_not_end_the_corridor():
+    """The wide free space begins farther than a metre away."""
     speck = lambda x, y: (np.abs(x - 0.4) < 0.1) & (np.abs(y - 0.5) < 0.1)  # noqa: E731
     layer = seen(lambda x, y: sides()(x, y) | speck(x, y) | (x < 0.7) & (y < -0.5))
     assert place(FollowCorridor(), layer, state(0.0))[0] > 3.0
 
 
-def test_where_nothing_is_known_ahead_it_wants_to_go_ahead():
+def test_unknown_space_ahead_is_the_goal():
     nothing = seen(lambda x, y: np.abs(y) > 1.0, lambda x, y: np.abs(x) > 0.3)
     assert place(FollowCorridor(), nothing, state(0.0)) == pytest.approx([1.5, 0.0], abs=0.1)
     assert len(FollowCorridor().goals(seen(lambda x, y: x > 1.2, lambda x, y: np.abs(x) > 0.3), state(0.0)))
     assert len(FollowCorridor().goals(seen(sides(end=0.9)), state(0.4))) == 0
 
 
-def test_a_drone_that_is_brought_back_goes_on_ahead():
+def test_backing_up_keeps_the_direction():
     """Its pose was lost, and the supervisor flew it back along its way."""
     layer = seen(sides(), lambda x, y: x > 4.0)
     way = [(x, 0.0) for x in np.arange(-4.0, 2.1, 0.5)]
@@ -157,7 +157,7 @@ def stub(x, y):
     return ~((np.abs(y) < 1.0) & (x < 3.0) | (np.abs(x) < 1.0) & (y > 0.0))
 
 
-def test_from_a_dead_end_it_comes_back_to_what_turns_off():
+def test_dead_end_leads_back_to_the_side_corridor():
     task, layer = FollowCorridor(), seen(stub)
     to_its_end = [(x, 0.0) for x in np.arange(-4.0, 2.3, 0.4)]
     assert follow(task, layer, *to_its_end)[1] > 1.6
@@ -168,28 +168,28 @@ def test_from_a_dead_end_it_comes_back_to_what_turns_off():
     assert last == pytest.approx([0.0, 5.4], abs=0.4), "ahead is where it flies now"
 
 
-def test_what_turns_off_is_flown_to_as_soon_as_its_mouth_is_seen():
-    """`l_corridor` 811: of it a drone sees, from its dead end, a tongue of half a metre's width."""
+def test_side_corridor_is_entered_once_its_mouth_is_seen():
+    """From the dead end only a strip half a metre wide is visible of the side corridor."""
     mouth = lambda x, y: (np.abs(x) < 0.9) & (y < 1.2) | (np.abs(x - 0.3 + 0.5 * (y - 1.0)) < 0.2) & (y < 1.8)  # noqa: E731
     layer = seen(stub, lambda x, y: (y > 0.9) & ~mouth(x, y))
     last = follow(FollowCorridor(), layer, *[(x, -0.2) for x in np.arange(-4.0, 2.3, 0.4)])
     assert last == pytest.approx([0.0, 1.6], abs=0.3)
 
 
-def test_before_a_wall_it_looks_into_the_holes_in_the_sides():
-    """`l_corridor` 812: in passing nothing of what turns off was seen but that no wall is there."""
+def test_side_openings_are_inspected_before_a_wall():
+    """In passing, only the missing wall of the side corridor was observed."""
     layer = seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
     to_its_end = [(x, 0.0) for x in np.arange(-4.0, 2.5, 0.4)]
     assert follow(FollowCorridor(), layer, *to_its_end) == pytest.approx([0.0, 1.2], abs=0.2)
     specks = seen(lambda x, y: stub(x, y) | (np.abs(x) < 0.1) & (np.abs(y - 0.6) < 0.1), lambda x, y: y > 2.0)
-    assert len(mouths(specks, np.array([2.4, 0.0]), np.array([1.0, 0.0]), ALONG_X)) == 1, "`l_corridor` 816"
+    assert len(mouths(specks, np.array([2.4, 0.0]), np.array([1.0, 0.0]), ALONG_X)) == 1, "noise is no wall"
     door = seen(lambda x, y: (np.abs(y) > 1.0) & ((np.abs(x) > 0.5) | (y < 0.0)) | (x > 3.0), lambda x, y: y > 1.1)
     assert len(mouths(door, np.array([2.4, 0.0]), np.array([1.0, 0.0]), ALONG_X)) == 0, "a door is none"
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_the_corridor_that_it_came_from_is_no_hole_in_the_side(side):
-    """`l_corridor` 830: from the end of the other corridor it flew back to the dead end."""
+def test_entry_corridor_is_no_side_opening(side):
+    """Otherwise the drone would return to the dead end from the other corridor."""
     layer = seen(stub, lambda x, y: (np.abs(x) < 1.0) & (y < -2.0))
     end, axis = np.array([0.0, 4.0]), np.array([0.0, 1.0])
     for past in (0.0, 0.8 * side):
@@ -200,7 +200,7 @@ def test_the_corridor_that_it_came_from_is_no_hole_in_the_side(side):
 
 
 def before_a_wall(task, layer):
-    """At the dead end of the stub for as long as a turn takes, and on to where it looks to the sides: what it wants."""
+    """Goals at the dead end during the full turn and at the viewpoint of the side looks."""
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
         found = task.goals(layer, state(x, 0.0, 0.5 * k))
     assert len(found) == 0, "a turn on the spot first"
@@ -211,8 +211,8 @@ def before_a_wall(task, layer):
     return wanted
 
 
-def test_sides_that_are_not_known_to_be_walls_are_looked_at_before_it_ends():
-    """`l_corridor` 816 and 817: nothing at all was seen of what turns off."""
+def test_unknown_sides_are_scanned_before_the_end():
+    """Nothing of the side corridor was observed in passing."""
     layer, task = seen(stub, lambda x, y: (y > 0.9) & (x < 2.6)), FollowCorridor()
     assert before_a_wall(task, layer) == pytest.approx([0.2, 0.0], abs=0.1)
     assert task.heading_rad(state(0.3, 0.0, 25.0)) == pytest.approx(math.pi / 2)
@@ -224,7 +224,7 @@ def test_sides_that_are_not_known_to_be_walls_are_looked_at_before_it_ends():
     assert len(task.goals(layer, state(2.2, 0.0, 30.0))) == 0 and task.done(state(2.2, 0.0, 30.0))
 
 
-def test_a_look_to_the_side_ends_with_the_pose():
+def test_tracking_loss_ends_a_side_look():
     task, layer = FollowCorridor(), seen(stub, lambda x, y: (np.abs(y) > 0.9) & (x < 2.6))
     before_a_wall(task, layer)
     assert task.heading_rad(replace(state(0.3, 0.0, 25.0), tracked=False)) is None
@@ -232,8 +232,8 @@ def test_a_look_to_the_side_ends_with_the_pose():
     assert place(task, layer, state(0.3, 0.0, 25.5)) == pytest.approx([2.4, 0.0], abs=0.1)
 
 
-def test_a_mouth_that_depth_has_made_narrow_is_flown_into_unless_it_is_a_door():
-    """`l_corridor` 822: two metres wide, and one metre on the map."""
+def test_narrowed_mouth_is_entered_unless_it_is_a_door():
+    """The mouth is two metres wide, and one metre on the map."""
     layer = seen(lambda x, y: stub(x, y) | (np.abs(x) > 0.5) & (y > 0.8))
     door = Exit(np.array([0.0, 1.0, 1.15]), np.array([0.0, 1.0, 0.0]), 1.0, 0.1, 0.1, 2)
     may_be = Candidate(door.centre_w[:2], door.normal_w[:2], np.array([-1.0, 0.0]))
@@ -245,8 +245,8 @@ def test_a_mouth_that_depth_has_made_narrow_is_flown_into_unless_it_is_a_door():
         assert bool((layer.centres(found)[:, 1] > 1.6).any()) is flies
 
 
-def test_from_a_hole_that_is_none_it_comes_back_to_the_end():
-    """`blank_walls` 828: a hole four metres back, which closed as it was looked into."""
+def test_closed_side_opening_leads_back_to_the_end():
+    """An opening four metres back that turns out closed."""
     task, hole = FollowCorridor(), seen(lambda x, y: sides(end=3.0)(x, y) & ~((np.abs(x + 1.0) < 0.9) & (y > 0.0)))
     closed = seen(sides(end=3.0))
     hole = Layer(hole.free & closed.free, hole.solid, hole.corner_w, hole.cell_m)
@@ -264,8 +264,8 @@ def test_from_a_hole_that_is_none_it_comes_back_to_the_end():
     assert len(task.goals(closed, state(2.2, 0.0, 36.6))) == 0 and task.done(state(2.2, 0.0, 36.6))
 
 
-def test_an_end_that_was_come_back_to_is_the_one_that_it_was():
-    """`corridor` 832: it had been 1.2 m before the door, and ended 1.6 m before it, after another turn."""
+def test_end_is_the_same_after_a_return():
+    """The second apparent end is 0.4 m from the first."""
     task, hole = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
     shorter = seen(lambda x, y: sides(end=2.6)(x, y))
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
@@ -277,7 +277,7 @@ def test_an_end_that_was_come_back_to_is_the_one_that_it_was():
     assert len(task.goals(shorter, state(2.2, 0.0, 16.0))) == 0
 
 
-def test_a_way_back_to_the_end_that_there_is_none_of_ends_it():
+def test_unreachable_end_ends_the_task():
     task, layer = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
         task.goals(layer, state(x, 0.0, 0.5 * k))
@@ -295,8 +295,8 @@ def lose(task, at):
         task.done(replace(at, stamp_s=at.stamp_s + k + 0.5, tracked=False, overridden=True))
 
 
-def test_a_bare_wall_before_which_the_pose_is_lost_ends_it():
-    """`l_corridor` 823: at the end of it, and "no way"."""
+def test_bare_wall_with_tracking_losses_ends_the_task():
+    """The task is done, not stuck."""
     task, layer = FollowCorridor(), seen(stub, lambda x, y: (np.abs(y) > 0.9) & (x < 2.6))
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
         task.goals(layer, state(x, 0.0, 0.5 * k))
@@ -304,8 +304,8 @@ def test_a_bare_wall_before_which_the_pose_is_lost_ends_it():
     assert task.done(state(1.9, 0.0, 12.0)) and task.wall
 
 
-def test_where_the_pose_is_lost_looking_into_a_hole_it_comes_back_to_the_end():
-    """`corridor` 830: it had been before the door, looked into a hole in a bare wall, and landed there."""
+def test_tracking_loss_in_a_side_opening_leads_back_to_the_end():
+    """The end is reached only there, not at the side opening."""
     task, layer = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
         found = task.goals(layer, state(x, 0.0, 0.5 * k))
@@ -317,8 +317,8 @@ def test_where_the_pose_is_lost_looking_into_a_hole_it_comes_back_to_the_end():
     assert task.done(state(1.6, 0.0, 15.0))
 
 
-def test_what_is_between_it_and_the_wall_is_no_way_on():
-    """`l_corridor` 817 and 818: between a hole in the side and a last step to the wall it stayed where it was."""
+def test_space_before_the_wall_is_no_continuation():
+    """Otherwise the drone oscillates between a side opening and a last step to the wall."""
     layer, mouth = seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0)), pytest.approx([0.0, 1.2], abs=0.2)
     task, to_its_end = FollowCorridor(), [(x, 0.0) for x in np.arange(-4.0, 2.5, 0.4)]
     assert follow(task, layer, *to_its_end) == mouth
@@ -355,7 +355,7 @@ def test_a_corridor_ends_in_a_room():
     assert task.done(state(0.6, stamp_s=8.0)) and task.room
 
 
-def test_what_is_unseen_beside_the_way_is_no_way_on():
+def test_unknown_space_beside_the_path_is_no_continuation():
     """Unseen ground half a metre behind the start, and nothing else to see: the far end is the goal."""
     layer = seen(lambda x, y: (np.abs(y) > 1.0) | (x > 4.0), lambda x, y: x < -0.5)
     task = FollowCorridor()

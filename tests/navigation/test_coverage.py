@@ -1,4 +1,4 @@
-"""What a search has looked at from before."""
+"""Coverage of borders by frontal views."""
 
 import math
 
@@ -31,7 +31,7 @@ def unlooked(*states):
     return coverage.unlooked(WALL)
 
 
-def test_what_is_before_the_drone_within_twenty_degrees_is_looked_at():
+def test_borders_within_twenty_degrees_ahead_are_covered():
     left = unlooked(at(0.0, 0.0, 90.0)).p_w[:, 0]
     reach = math.tan(math.radians(20.0))
     np.testing.assert_allclose(left, [x for x in WALL.p_w[:, 0] if abs(x) > reach], atol=1e-9)
@@ -48,11 +48,11 @@ def test_what_is_before_the_drone_within_twenty_degrees_is_looked_at():
         ("by telemetry", at(0.0, 0.0, 90.0, tracked=False)),
     ],
 )
-def test_other_views_look_at_none_of_it(case, state):
+def test_other_views_cover_nothing(case, state):
     assert len(unlooked(state).p_w) == len(WALL.p_w), case
 
 
-def test_views_add_up_and_alike_ones_are_kept_once():
+def test_views_accumulate_without_duplicates():
     coverage = Coverage()
     for x in (-0.6, 0.0, 0.05, 0.6):
         for yaw in (88.0, 91.0):
@@ -61,7 +61,7 @@ def test_views_add_up_and_alike_ones_are_kept_once():
     assert np.abs(coverage.unlooked(WALL).p_w[:, 0]).min() > 0.9
 
 
-def test_views_go_along_with_the_map():
+def test_views_follow_map_corrections():
     """Metres become twice as long: what was seen 2 m away is 1 m away."""
     coverage = Coverage()
     coverage.note(at(2.0, 0.0, 90.0))
@@ -79,7 +79,7 @@ def test_borders_are_where_the_free_space_ends_and_face_it():
     assert long.sum() == pytest.approx(2 * 60, abs=4), "both sides"
 
 
-def test_a_thing_in_the_room_and_another_room_are_no_borders_to_look_at():
+def test_furniture_and_other_rooms_are_no_borders():
     """A chair; and space behind a wall, as rays through a window leave it."""
     chair = corridor(solid=lambda x, y: (np.abs(x - 1.0) < 0.2) & (np.abs(y) < 0.2))
     around = np.linalg.norm(borders(chair, np.array([0.0, 0.0])).p_w - [1.0, 0.0], axis=1)
@@ -89,7 +89,7 @@ def test_a_thing_in_the_room_and_another_room_are_no_borders_to_look_at():
     assert borders(beyond, np.array([0.0, 2.0])).p_w[:, 1].min() > 1.2
 
 
-def test_nothing_known_has_no_borders():
+def test_unknown_space_has_no_borders():
     nothing = corridor(free=lambda x, y: np.zeros(x.shape, bool))
     assert len(borders(nothing, np.array([0.0, 0.0])).p_w) == 0
     assert len(Coverage().unlooked(borders(nothing, np.array([0.0, 0.0]))).p_w) == 0

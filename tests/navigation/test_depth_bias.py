@@ -1,4 +1,4 @@
-"""What a network's metre usually is."""
+"""Bias of a depth network."""
 
 import numpy as np
 import pytest
@@ -25,11 +25,11 @@ def knows(rng, ratio=0.8, unit_m=1.0, pictures=20):
     return usual
 
 
-def test_a_fit_tells_the_ratio_of_depths_whatever_its_slope(rng):
+def test_fit_yields_the_depth_ratio_for_any_slope(rng):
     assert fit(rng, 0.8).ratio_log == pytest.approx(np.log(0.8), abs=0.05)
 
 
-def test_the_usual_line_is_in_the_units_of_the_map(rng):
+def test_bias_line_is_in_map_units(rng):
     usual = knows(rng, unit_m=2.0)
     for unit_m in (2.0, 0.5):
         line = usual.line(unit_m)
@@ -38,7 +38,7 @@ def test_the_usual_line_is_in_the_units_of_the_map(rng):
         assert line.sigma_log == ALONE_SIGMA
 
 
-def test_points_in_another_unit_are_not_believed(rng):
+def test_points_at_another_scale_are_rejected(rng):
     usual = knows(rng)
     assert usual.is_consistent(fit(rng, 0.8 * 1.25), 1.0, sure=True), "pictures differ"
     for ratio in (0.8 * 1.8, 0.8 / 1.8):
@@ -46,7 +46,7 @@ def test_points_in_another_unit_are_not_believed(rng):
     assert np.exp(usual.line(1.0).offset) == pytest.approx(0.8, rel=0.04), "nor remembered"
 
 
-def test_nothing_is_usual_before_some_seconds_of_sure_metres(rng):
+def test_bias_needs_seconds_of_certain_scale(rng):
     usual = knows(rng, pictures=10)
     assert usual.line(1.0) is None
     assert usual.is_consistent(fit(rng, 2.4), 1.0, sure=False)
@@ -55,7 +55,7 @@ def test_nothing_is_usual_before_some_seconds_of_sure_metres(rng):
     assert usual.line(1.0) is None
 
 
-def test_what_many_pictures_say_on_end_becomes_usual(rng):
+def test_persistent_outliers_reset_the_bias(rng):
     """The metres that it rested on were wrong, and are right now."""
     usual = knows(rng)
     consistent = [usual.is_consistent(fit(rng, 2.4), 1.0, sure=True) for _ in range(120)]
@@ -63,7 +63,7 @@ def test_what_many_pictures_say_on_end_becomes_usual(rng):
     assert np.exp(usual.line(1.0).offset) == pytest.approx(2.4, rel=0.04)
 
 
-def test_a_second_of_pictures_in_another_unit_makes_metres_doubtful(rng):
+def test_a_second_of_outliers_puts_the_scale_in_doubt(rng):
     usual = knows(rng)
     for _ in range(4):
         usual.is_consistent(fit(rng, 0.8 * 3.0), 1.0, sure=True)
@@ -77,7 +77,7 @@ def test_a_second_of_pictures_in_another_unit_makes_metres_doubtful(rng):
     assert usual.doubt == pytest.approx(0.75, rel=0.1), "too short as well as too long"
 
 
-def test_a_single_picture_between_begins_the_count_anew(rng):
+def test_an_inlier_resets_the_outlier_count(rng):
     usual = knows(rng)
     for _ in range(3):
         for _ in range(60):
@@ -85,7 +85,7 @@ def test_a_single_picture_between_begins_the_count_anew(rng):
         assert usual.is_consistent(fit(rng, 0.8), 1.0, sure=True)
 
 
-def test_points_of_a_wall_say_nothing_of_the_room_behind_its_door(rng):
+def test_wall_points_do_not_correct_the_room_behind_the_door(rng):
     """A network with a wall 1.3 times too far, and the room right: the wall is mended, the room stays."""
     network = np.full((120, 160), 2.4, np.float32)
     network[:, :70] = 1.3
@@ -99,7 +99,7 @@ def test_points_of_a_wall_say_nothing_of_the_room_behind_its_door(rng):
     assert np.median(own.applied(depth).depth_m[:, 110:]) < 2.0, "by its own line it is a fifth nearer"
 
 
-def test_away_from_its_points_a_picture_is_surer_than_one_without(rng):
+def test_frame_with_points_is_more_certain_away_from_them_than_without(rng):
     """But not as sure as beside them."""
     usual = knows(rng, 1.0)
     network = np.full((120, 160), 1.0, np.float32)
@@ -112,7 +112,7 @@ def test_away_from_its_points_a_picture_is_surer_than_one_without(rng):
 
 
 def test_points_at_all_depths_bend_the_line_everywhere(rng):
-    """A network that compresses depth, as the usual one has not."""
+    """A network that compresses depth, unlike the bias line."""
     true = rng.uniform(0.6, 5.0, (120, 160)).astype(np.float32)
     depth = DepthMap(1.2 * true**0.8, np.zeros_like(true))
     uv = rng.integers([0, 0], [160, 120], (800, 2)).astype(float)
@@ -122,7 +122,7 @@ def test_points_at_all_depths_bend_the_line_everywhere(rng):
     assert np.median(error) < 0.05 < np.median(np.abs(np.log(depth.depth_m / true)))
 
 
-def test_the_usual_slope_is_that_of_pictures_of_many_depths(rng):
+def test_bias_slope_comes_from_frames_with_a_wide_depth_range(rng):
     usual = DepthBias()
     for _ in range(20):
         true = rng.uniform(0.6, 5.0, (40, 60)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What is remembered goes along with the view nearest to it."""
+"""Stored positions follow the nearest view."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_places_move_as_points_at_the_height_of_their_views():
     assert MapUpdate(BEFORE, AFTER, 2.0).points(np.array([[5.0, 0.0]])) == pytest.approx(np.array([[4.0, 3.0]]))
 
 
-def test_views_told_before_are_exactly_where_they_are_now():
+def test_views_map_exactly_to_their_new_poses():
     assert MapUpdate(BEFORE, AFTER, 2.0).poses(BEFORE) == pytest.approx(AFTER)
 
 
@@ -42,7 +42,7 @@ def test_of_views_at_one_place_the_newest_counts():
     assert both.points(np.array([[1.0, 0.0]])) == pytest.approx(np.array([[1.0, 0.5]]))
 
 
-def test_what_a_picture_showed_goes_along_with_the_view_of_that_time():
+def test_points_follow_the_view_nearest_in_time():
     """A piece of map lay across the first one by mistake, and moves away from it."""
     across = MapUpdate(
         np.array([pose(4.0, 0.0), pose(8.0, 0.0), pose(4.0, 0.0)]),
@@ -57,11 +57,11 @@ def test_what_a_picture_showed_goes_along_with_the_view_of_that_time():
     assert unnumbered.points(door[:1], [10]) == pytest.approx(np.array([[6.5, 1.0]]))
 
 
-def test_nothing_remembered_moves_to_nothing():
+def test_no_points_map_to_no_points():
     assert MapUpdate(BEFORE, AFTER).points(np.zeros((0, 3))).shape == (0, 3)
 
 
-def test_less_than_a_cell_is_no_move():
+def test_moves_below_a_cell_are_ignored():
     shifted = BEFORE.copy()
     shifted[0, 0, 3] += 0.11
     assert moves(BEFORE, shifted, 0.1)

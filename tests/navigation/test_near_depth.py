@@ -1,4 +1,4 @@
-"""Depth of a network brought to the map's metres."""
+"""Alignment of network depth to the map."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def test_a_right_network_is_left_as_it_is(rng):
     assert fit.offset == pytest.approx(0.0, abs=1e-6)
 
 
-def test_too_few_points_tell_nothing(rng):
+def test_too_few_points_yield_no_fit(rng):
     network, seen = compressed(rng, MIN_POINTS - 1)
     assert fit_near(network, seen) is None
     assert fit_near(np.full(50, np.nan), np.ones(50)) is None
@@ -59,7 +59,7 @@ def half_seen(rng, residual, shape=(120, 160)):
     return uv, residual + 0.02 * rng.standard_normal(1000), shape
 
 
-def test_points_mend_the_line_where_they_are_and_nowhere_else(rng):
+def test_points_correct_the_line_only_locally(rng):
     uv, residual, shape = half_seen(rng, -0.4)
     error, sigma = local_error(uv, np.zeros(len(uv)), residual, 0.3, np.zeros(shape))
     assert error.shape == sigma.shape == shape
@@ -69,7 +69,7 @@ def test_points_mend_the_line_where_they_are_and_nowhere_else(rng):
 
 
 def test_depth_without_points_nearby_is_as_unsure_as_the_network(rng):
-    """A room that fits to 3 % tells nothing of what is seen through its door."""
+    """A fit of 3 % in a room does not extend to the space behind its door."""
     uv, residual, shape = half_seen(rng, 0.0)
     fit = NearFit(0.0, 1.0, 0.03, len(uv), uv, np.full(len(uv), LEVEL), residual)
     network = DepthMap(np.full(shape, 2.0, np.float32), np.full(shape, 0.1, np.float32))
@@ -80,7 +80,7 @@ def test_depth_without_points_nearby_is_as_unsure_as_the_network(rng):
 
 
 @pytest.mark.parametrize("ratio", [0.5, 2.0])
-def test_a_doors_frame_tells_nothing_of_the_room_behind_it(rng, ratio):
+def test_door_frame_does_not_correct_the_room_behind_it(rng, ratio):
     """Points all around, at another depth than that of the pixels in the middle."""
     uv, shape = rng.uniform([0, 0], [160, 120], (1500, 2)), (120, 160)
     uv = uv[np.abs(uv - [80, 60]).max(axis=1) > 16]
@@ -101,7 +101,7 @@ def test_a_fit_of_another_picture_is_its_line_alone(rng):
     assert metres.sigma_log.min() >= 0.29
 
 
-def test_what_points_show_nearer_becomes_nearer(rng):
+def test_nearer_points_bring_depth_nearer(rng):
     uv, residual, shape = half_seen(rng, np.log(0.6))
     metres = NearFit(0.0, 1.0, 0.3, len(uv), uv, np.full(len(uv), LEVEL), residual).applied(
         DepthMap(np.full(shape, 2.0, np.float32), np.full(shape, 0.1, np.float32))
@@ -109,14 +109,14 @@ def test_what_points_show_nearer_becomes_nearer(rng):
     assert np.median(metres.depth_m[:, 10:60]) == pytest.approx(1.2, rel=0.08)
 
 
-def test_points_that_something_hides_do_not_push_it_away(rng):
+def test_occluded_points_do_not_increase_depth(rng):
     uv, residual, shape = half_seen(rng, 0.0)
     residual[::4] = 1.2
     error, _ = local_error(uv, np.zeros(len(uv)), residual, 0.1, np.zeros(shape))
     np.testing.assert_allclose(error, 0.0, atol=0.03)
 
 
-def test_points_far_before_what_the_network_sees_are_what_a_drone_would_touch(rng):
+def test_points_far_in_front_of_network_depth_count(rng):
     """A door leaf at 0.6 m before a wall that the network sees at 2 m, in a room that fits it to 10 %."""
     uv, residual, shape = half_seen(rng, np.log(0.3))
     metres = NearFit(0.0, 1.0, 0.1, len(uv), uv, np.full(len(uv), LEVEL), residual).applied(

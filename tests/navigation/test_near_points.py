@@ -1,4 +1,4 @@
-"""Points of the map before what a depth map shows."""
+"""Map points in front of a depth map."""
 
 import numpy as np
 import pytest
@@ -28,12 +28,12 @@ def test_the_nearest_of_the_points_in_a_pixel_counts():
     assert with_nearer_points(WALL, np.repeat(AT, 3, 0), np.array([1.2, 0.7, 0.9])).depth_m[45, 60] == np.float32(0.7)
 
 
-def test_what_the_network_sees_nearer_stays():
+def test_nearer_network_depth_is_kept():
     told = with_nearer_points(WALL, AT, np.array([5.0]))
     assert (told.depth_m == 3.0).all() and (told.sigma_log == np.float32(0.3)).all()
 
 
-def test_points_tell_depth_where_the_network_does_not():
+def test_points_fill_unknown_network_depth():
     unknown = DepthMap(np.full((90, 120), np.nan, np.float32), np.full((90, 120), np.nan, np.float32))
     told = with_nearer_points(unknown, AT, np.array([2.0]))
     assert told.depth_m[45, 60] == pytest.approx(2.0) and np.isfinite(told.sigma_log[45, 60])
@@ -54,11 +54,11 @@ def test_points_agree_when_there_are_enough_in_one_place():
 
 
 @pytest.mark.parametrize("shift", np.linspace(0.0, 2.4, 9))
-def test_no_border_of_cells_parts_what_is_together(shift):
+def test_cell_borders_do_not_split_groups(shift):
     assert len(agreeing(*cluster(0.8 * np.exp(0.05 * shift), u=59.0 + shift), 120)) == MIN_AGREEING
 
 
-def test_points_are_seen_where_they_are_and_not_from_behind():
+def test_points_project_only_in_front_of_the_camera():
     T_w_c = np.eye(4)
     T_w_c[:3, :3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]  # looks along x
     T_w_c[:3, 3] = [1.0, 2.0, 0.5]

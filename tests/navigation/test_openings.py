@@ -85,7 +85,7 @@ def bulging(a, b):
     ],
 )
 @pytest.mark.parametrize("angle", [0.0, 0.5])
-def test_what_is_no_exit(case, solid, unseen, low, angle):
+def test_false_openings_are_no_exits(case, solid, unseen, low, angle):
     seen = surroundings(solid, unseen or (lambda a, b: np.zeros(a.shape, bool)), angle, low)
     assert gaps(seen) == [], case
 
@@ -115,7 +115,7 @@ def test_a_door_into_which_its_frame_smears_may_be_one(angle):
         ("nothing was seen behind it", smeared(is_unseen=lambda a, b: a > 2.15)),
     ],
 )
-def test_what_can_be_no_door(case, walls):
+def test_impossible_doors_are_rejected(case, walls):
     assert openings(along_walls(walls, HERE)) == [], case
 
 
@@ -141,7 +141,7 @@ def test_an_exit_is_seen_from_two_places():
     assert exit_.beyond(1.0)[0] == pytest.approx(3.0, abs=0.12)
 
 
-def test_what_was_seen_from_one_place_is_a_candidate_until_it_is_seen_from_another():
+def test_one_viewpoint_makes_a_candidate_two_an_exit():
     walls = surroundings(wall(0.9))
     assert watched([0.0], walls).candidates == (), "one look is chance"
     (candidate,) = watched([0.0] * 8, walls).candidates
@@ -173,8 +173,8 @@ def test_an_opening_that_closes_under_closer_looks_is_forgotten():
     assert watch.exits == ()
 
 
-def test_what_many_looks_told_is_not_told_while_later_ones_show_a_wall():
-    """Two rooms, seed 798: a poster that was told to be six metres deep, from afar."""
+def test_exit_is_withdrawn_after_consecutive_misses():
+    """From afar, depth shows a poster six metres deep."""
     door, closed = surroundings(wall(0.9)), surroundings(wall(0.0))
     watch = watched([0.0, 0.2, 0.4, 0.6] * 10, door)
     for k in range(8):
@@ -188,7 +188,7 @@ def test_what_many_looks_told_is_not_told_while_later_ones_show_a_wall():
 
 
 def test_an_exit_was_seen_by_looks_at_it():
-    """`doors` 802: a corridor that noise narrows, seen again and again by a drone that flies away from it."""
+    """A corridor narrowed by noise, seen repeatedly from a growing distance."""
     door, closed = surroundings(wall(0.9)), surroundings(wall(0.0))
     watch = ExitTracker()
     for k, x in enumerate([1.0, 0.4, 0.0, -0.4] * 5):
@@ -220,7 +220,7 @@ def flown(ys, closed=False):
 
 
 def test_what_it_flew_through_is_an_exit_whatever_looks_show_later():
-    """`two_rooms` 809: walls half a metre thick on the map, by two rooms that see them .2 m apart."""
+    """Walls half a metre thick on the map: both rooms see them with an offset of 0.2 m."""
     assert len(flown(0.0).exits) == 1
     assert flown(0.0).candidates == ()
     assert flown(0.8).exits == (), "beside it"
@@ -242,7 +242,7 @@ def test_a_jump_of_the_pose_is_no_way_through():
     [("along the wall", 1.4, -1.6, 68.0), ("from afar", -0.7, 0.0, 0.0), ("elsewhere", 0.6, 0.0, 30.0)],
 )
 def test_looks_that_see_nothing_of_an_exit_do_not_speak_against_it(case, x, y, yaw_deg):
-    """`doors` 804: a door beside the corridor, taken back by a drone that flew along it."""
+    """A door beside the corridor, seen at a grazing angle while passing it."""
     watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     for k in range(20):
         watch.look(surroundings(wall(0.0)), state(x, y, 5.0 + 0.5 * k, math.radians(yaw_deg)))
@@ -291,7 +291,7 @@ def test_pillars_are_no_exit_once_their_surroundings_are_seen():
 
 
 def test_ten_seconds_that_know_a_way_round_outvote_what_did_not_know_it_yet():
-    """`cluttered_room` 800: a gap beside a cupboard, for forty seconds seen from behind it alone."""
+    """A gap beside a cupboard, seen from behind it only."""
     door, pillars = surroundings(wall(0.9)), surroundings(PILLARS)
     watch = watched([0.0, 0.2, 0.4, 0.6] * 20, door)
     for k in range(19):
@@ -317,8 +317,8 @@ def test_a_way_round_that_comes_and_goes_takes_back_no_door():
 PILLARS = lambda a, b: wall(0.9)(a, b) & (np.abs(b) < 1.2)  # noqa: E731
 
 
-def test_a_hole_in_the_wall_beside_a_door_takes_it_back_neither_for_a_moment_nor_from_afar():
-    """`two_rooms` 790: seen from eighteen places, and gone as the drone looked back from its take-off."""
+def test_exit_survives_a_hole_beside_it_and_views_from_afar():
+    """Depth errors open a hole in the wall: for a moment close by, or for long from afar."""
     watch = watched([0.0, 0.2, 0.4, 0.6, 0.6, 0.6, 0.6], surroundings(wall(0.9)))
     for k in range(3):
         watch.look(surroundings(PILLARS), state(0.6, stamp_s=5.0 + 0.5 * k))
@@ -330,7 +330,7 @@ def test_a_hole_in_the_wall_beside_a_door_takes_it_back_neither_for_a_moment_nor
 
 @pytest.mark.parametrize(("apart", "count"), [(0.8, 1), (1.4, 2)])
 def test_a_passage_has_one_door(apart, count):
-    """A door, and what stands before it as wide apart."""
+    """A door, and two objects in front of it with the same gap."""
     both = surroundings(lambda a, b: wall(0.9)(a, b) | wall(0.9, at=2.0 - apart)(a, b))
     watch = watched([-1.0, -0.8, -0.6, -0.4, -0.2], both)
     assert len(watch.exits) == count
@@ -405,7 +405,7 @@ def test_upright_is_what_fills_the_height():
 
 
 def test_an_exit_stays_where_its_pictures_stay():
-    """`doors` 808: a piece of map that lay across the door by mistake took it along by a metre when it was mended."""
+    """A misplaced submap that overlaps the door must not move it when corrected."""
     walls, watch = surroundings(wall(0.9)), ExitTracker()
     for k, x in enumerate([0.0, 0.2, 0.4, 0.6]):
         view = View(0.5 * k, np.zeros((2, 2)), np.zeros((2, 2)), np.eye(3), np.eye(4), picture=10 + k)

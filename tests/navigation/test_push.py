@@ -1,4 +1,4 @@
-"""What holds a drone, by its pose and by its own velocities."""
+"""Contact detection by the pose and by reported velocities."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ AHEAD = np.array([1.0, 0.0])
 
 
 def held_after_s(velocities_w, reported_m_s, towards_w=lambda k: AHEAD, seconds=6.0):
-    """When it is held first, of a push by 20 states a second; None if never."""
+    """Time of the first contact, at 20 states a second; None if never."""
     push = Push()
     for k in range(round(20 * seconds)):
         now = k / 20
@@ -34,7 +34,7 @@ def shaking(k):
         (lambda k: (-0.2, 0.0), lambda k: 0.0),  # a pose that runs away
     ],
 )
-def test_it_is_held_after_a_second_and_a_half(velocities_w, reported_m_s):
+def test_contact_after_a_second_and_a_half(velocities_w, reported_m_s):
     assert held_after_s(velocities_w, reported_m_s) == pytest.approx(1.55, abs=0.06)
 
 
@@ -48,12 +48,12 @@ def test_it_is_held_after_a_second_and_a_half(velocities_w, reported_m_s):
         (lambda k: (0.0, 0.2), lambda k: 0.2),  # along what it pushes against
     ],
 )
-def test_it_is_not_held_where_it_moves(velocities_w, reported_m_s):
+def test_moving_is_no_contact(velocities_w, reported_m_s):
     assert held_after_s(velocities_w, reported_m_s) is None
 
 
 def test_to_and_fro_is_no_push():
-    """A second each way: no movement is asked for long enough."""
+    """A second in each direction: no command lasts long enough."""
     assert held_after_s(lambda k: (0.0, 0.0), lambda k: 0.0, lambda k: AHEAD * (-1.0) ** (k // 20)) is None
 
 
@@ -61,7 +61,7 @@ def test_a_pause_begins_it_anew():
     assert held_after_s(lambda k: (0.0, 0.0), lambda k: 0.0, lambda k: None if k % 25 == 24 else AHEAD) is None
 
 
-def test_what_it_was_told_before_a_pause_does_not_count():
+def test_a_pause_resets_the_detection():
     push = Push()
     still = DroneState(0.0, np.zeros(3), 0.0, np.zeros(3))
     assert not any(push.holds(still, AHEAD, k / 20) for k in range(20))

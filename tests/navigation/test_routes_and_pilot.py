@@ -148,11 +148,11 @@ def test_frontiers_are_where_the_known_ends():
         (VelocityCommand(forward_m_s=9.0), (0.0, 1.0, 0.0, 0.0)),
     ],
 )
-def test_wishes_become_sticks(command, sticks):
+def test_commands_become_sticks(command, sticks):
     assert command.sticks() == pytest.approx(sticks)
 
 
-def test_a_wish_that_is_no_number_is_refused():
+def test_non_finite_command_is_refused():
     with pytest.raises(ValueError, match="finite"):
         VelocityCommand(forward_m_s=math.nan).sticks()
 
@@ -166,8 +166,8 @@ def test_a_pilot_without_a_position_decides_nothing():
         Pilot(GoTo(np.array([1.0, 0.0, 1.0]))).update(at(math.nan, 0.0))
 
 
-def test_a_pilot_that_sees_nothing_does_not_leave_what_it_knows():
-    """For twenty seconds in the dark it never asks to move farther than the free place of its take-off."""
+def test_planner_without_views_stays_in_known_space():
+    """In twenty seconds without views it never leaves the free area around the take-off."""
     pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
     drone = DroneModel()
     drone.take_off()
@@ -183,7 +183,7 @@ def test_a_pilot_that_sees_nothing_does_not_leave_what_it_knows():
     assert pilot.phase is not Phase.DONE
 
 
-def test_a_sweep_leaves_out_the_side_where_the_pose_is_lost():
+def test_sweep_skips_the_side_with_tracking_loss():
     """The wall on the right shows nothing; the left is looked at all the same, then it goes on."""
     pilot, yaw, seen = Pilot(GoTo(np.array([3.0, 0.0, 1.15]))), 0.0, []
     for k in range(400):
@@ -199,7 +199,7 @@ def test_a_sweep_leaves_out_the_side_where_the_pose_is_lost():
     assert max(seen) > math.radians(36.0)
 
 
-def test_its_speed_averages_out_what_telemetry_cuts_off():
+def test_dithered_speed_averages_out_truncation():
     """Readings of whole decimetres a second, with half a step added, are right in the mean along a free way."""
     pilot, speeds = before_a_free_way(), []
     for k in range(15 * 4):
@@ -211,8 +211,8 @@ def test_its_speed_averages_out_what_telemetry_cuts_off():
 
 
 @pytest.mark.parametrize("tracked", [True, False])
-def test_without_a_picture_it_flies_in_no_direction_that_telemetry_does_not_tell(tracked):
-    """A Tello tells whole decimetres a second along the axes of its power-on: what is less is told as none."""
+def test_dead_reckoning_avoids_velocities_below_the_quantisation_step(tracked):
+    """A Tello reports whole dm/s in power-on axes; lower velocities read 0."""
     pilot, sideways = before_a_free_way(), []
     pilot.task = GoTo(np.array([6.0, 0.75, 1.15]))
     for k in range(15):
@@ -229,7 +229,7 @@ def before_a_free_way():
     return pilot
 
 
-def test_where_no_way_is_known_it_looks_left_and_right_of_the_goal():
+def test_without_a_path_it_searches_around_the_goal():
     pilot, yaw, seen = before_a_free_way(), 0.0, []
     pilot.task = GoTo(np.array([0.0, 5.0, 1.15]))
     pilot.space.points(np.array([[x, 1.0, z] for x in np.arange(-9.0, 9.0, 0.05) for z in (1.05, 1.15, 1.25)]))
@@ -268,13 +268,13 @@ def after_looking(pilot):
     return pilot.update(replace(at(0.3, 0.05), stamp_s=(k + 1) / 15))
 
 
-def test_after_a_look_in_vain_it_passes_the_unseen_slowly_at_a_hulls_distance():
+def test_after_a_failed_look_unknown_space_is_passed_slowly():
     command = after_looking(before_a_strip())
     assert 0.1 < command.forward_m_s <= 0.31
 
 
 @pytest.mark.parametrize(("gap_m", "passes"), [(None, True), (0.7, True), (0.3, False)])
-def test_it_goes_back_the_way_it_came_although_it_never_saw_what_is_beside_it(gap_m, passes):
+def test_it_returns_along_the_path_flown_beside_unknown_space(gap_m, passes):
     """Through a door, the frame of which is too near for its camera; not where a solid is seen in its way by now."""
     pilot = before_a_strip(gap_m)
     for x in np.arange(0.0, 3.5, 0.1):
@@ -288,7 +288,7 @@ def test_it_goes_back_the_way_it_came_although_it_never_saw_what_is_beside_it(ga
     assert (0.1 < max(ahead) <= 0.31) == passes
 
 
-def test_a_way_beside_the_one_it_came_is_none():
+def test_a_path_beside_the_one_flown_is_refused():
     pilot = before_a_strip()
     for x in np.arange(0.0, 3.5, 0.1):
         pilot.space.flown(np.array([x, 0.35, 1.15]), 0.05)
@@ -296,7 +296,7 @@ def test_a_way_beside_the_one_it_came_is_none():
 
 
 def closed(pilot):
-    """A wall across the way, from end to end of what it knows."""
+    """A wall across the path, over the whole known space."""
     y = np.arange(-7.95, 8.0, 0.1)
     pilot.space.points(np.array([[1.0, across, z] for across in y for z in (1.05, 1.15, 1.25)]))
 
@@ -312,14 +312,14 @@ def stays(pilot, seconds, begin_s=0.0, **fields):
     return phases
 
 
-def test_small_movements_to_and_fro_are_ended_by_a_look_from_higher_once():
-    """The way is free, the drone wants to go, and comes no farther: wind, or a map that says otherwise each time."""
+def test_oscillation_triggers_one_look_from_above():
+    """The path is free but the drone makes no progress: wind, or an alternating map."""
     phases = stays(before_a_free_way(), 14.0)
     assert phases.count(Phase.RISING) == 1
     assert phases.index(Phase.RISING) / 15 == pytest.approx(5.0, abs=0.2)
 
 
-def test_what_closes_the_way_is_doubted_once_before_the_task_is_given_up():
+def test_obstacles_are_reset_once_before_giving_up():
     pilot = before_a_free_way()
     closed(pilot)
     pilot.add_contact(Contact(np.array([0.0, 3.0, 1.15]), np.array([0.0, 1.0])))
@@ -335,28 +335,28 @@ def test_what_closes_the_way_is_doubted_once_before_the_task_is_given_up():
     assert Phase.RISING not in stays(pilot, 1.0, 36.0)
 
 
-def test_what_was_solid_is_not_passed_at_a_hulls_distance():
+def test_reset_obstacles_keep_full_clearance():
     pilot = before_a_strip()
     assert after_looking(pilot).forward_m_s > 0.1
     pilot._doubted_w = np.array([0.3, 0.05])
     assert pilot.update(replace(at(0.3, 0.05), stamp_s=9.0)).forward_m_s < 0.01
 
 
-def test_a_lost_pose_doubts_nothing():
+def test_lost_tracking_resets_no_obstacles():
     pilot = before_a_free_way()
     closed(pilot)
     assert stays(pilot, 16.0, tracked=False)[-1] is Phase.STUCK
     assert pilot.space.layer(1.15, 0.15).solid.any()
 
 
-def test_time_in_which_its_wishes_are_not_followed_is_no_lack_of_progress():
+def test_overridden_time_is_no_lack_of_progress():
     pilot = before_a_free_way()
     closed(pilot)
     assert set(stays(pilot, 30.0, overridden=True)) == {Phase.FLYING}
     assert Phase.RISING in stays(pilot, 16.0, 30.0)
 
 
-def test_a_map_that_moves_is_no_progress():
+def test_map_correction_is_no_progress():
     """To and fro by a decimetre, twice a second: what was free and solid goes along, and the way stays closed."""
     pilot = before_a_free_way()
     closed(pilot)
@@ -374,7 +374,7 @@ def test_a_map_that_moves_is_no_progress():
 
 
 @pytest.mark.parametrize(("apart_m", "forgotten"), [(0.1, False), (0.13, True)])
-def test_what_another_piece_of_map_showed_is_forgotten_when_it_may_lie_elsewhere(apart_m, forgotten):
+def test_views_of_an_uncertain_submap_are_dropped(apart_m, forgotten):
     """A door that may be a quarter of a metre beside where it was seen is none to fly through."""
     pilot = before_a_free_way()
 
@@ -393,14 +393,14 @@ def test_what_another_piece_of_map_showed_is_forgotten_when_it_may_lie_elsewhere
     assert (old, new) == (not forgotten, True)
 
 
-def test_it_does_not_rise_for_a_view_that_a_lost_pose_cannot_give():
+def test_no_rise_for_a_view_while_tracking_is_lost():
     pilot = before_a_strip()
     for k in range(60):
         pilot.update(replace(at(0.3, 0.05), stamp_s=k / 15, tracked=False))
     assert pilot.phase is Phase.FLYING
 
 
-def test_a_carried_pose_keeps_the_height_that_the_drone_measures():
+def test_dead_reckoning_uses_the_reported_height():
     """It thinks that it sank to .9 m, and rose to 1.4."""
     told = replace(at(0.0, 0.0), p_w=np.array([0.0, 0.0, 0.9]), reported_height_m=1.4)
     assert before_a_free_way().update(told).up_m_s > 0.1
@@ -426,15 +426,15 @@ def test_it_arrives_within_a_stated_distance_of_its_goal(off_m, arrived):
         (0.31, 0.5, 0.13, False),
     ],
 )
-def test_where_telemetry_carries_it_no_farther_its_doubt_is_near_enough(off_m, scale_sigma, sigma_m, arrived):
+def test_arrival_within_the_dead_reckoning_uncertainty(off_m, scale_sigma, sigma_m, arrived):
     goal, there = GoTo(np.array([12.0, 0.0, 1.15])), at(12.0 - off_m, 0.0)
     lost = replace(there, scale_sigma=scale_sigma, position_sigma_m=sigma_m, tracked=False)
     assert goal.done(lost) == arrived
 
 
 @pytest.mark.parametrize(("off_m", "tries", "arrived"), [(0.4, 3, True), (0.4, 2, False), (0.55, 9, False)])
-def test_a_pose_that_is_lost_near_the_goal_again_and_again_comes_no_nearer(off_m, tries, arrived):
-    """Brought back each time, it finds its pose again; each loss is told at every moment that it lasts."""
+def test_repeated_loss_near_the_goal_counts_as_arrived(off_m, tries, arrived):
+    """It relocalises after each loss; a loss is reported in every state while it lasts."""
     goal, there = GoTo(np.array([12.0, 0.0, 1.15])), replace(at(12.0 - off_m, 0.0), position_sigma_m=0.05)
     for _ in range(3):  # what is lost on the way says nothing about the goal
         goal.done(at(10.9, 0.0))
@@ -450,8 +450,8 @@ def test_a_pose_that_is_lost_near_the_goal_again_and_again_comes_no_nearer(off_m
 @pytest.mark.parametrize(
     ("places", "gives_up"), [([0.0] * 5, True), ([0.0] * 4, False), ([0, 0, 0, 0, 2, 2, 2, 0, 0], False)]
 )
-def test_it_gives_up_where_its_pose_is_lost_again_and_again(places, gives_up):
-    """Five times within a metre and a half; a loss is told at every moment that it lasts, and is another one after the
+def test_repeated_tracking_loss_gives_up(places, gives_up):
+    """Five times within 1.5 m; a loss is reported in every state while it lasts, and is another one after the
     pose was known. A new task begins anew."""
     pilot, now_s = before_a_free_way(), 10.0
     for x in places:
@@ -466,8 +466,8 @@ def test_it_gives_up_where_its_pose_is_lost_again_and_again(places, gives_up):
 
 
 @pytest.mark.parametrize("task", [Explore(), WayHome(np.zeros((0, 2)))], ids=["explore", "home"])
-def test_who_searches_and_who_comes_home_does_not_give_up(task):
-    """`blank_walls` 798: five losses in half a minute of a search, and five a metre from home."""
+def test_exploration_and_return_never_give_up(task):
+    """However often tracking is lost."""
     pilot = before_a_free_way()
     pilot.begin(task)
     for k in range(12):
@@ -475,7 +475,7 @@ def test_who_searches_and_who_comes_home_does_not_give_up(task):
     assert pilot._losses.count == 6 and pilot.phase is not Phase.STUCK
 
 
-def test_a_hulls_distance_is_for_the_unseen_not_for_solids():
+def test_hull_distance_applies_to_unknown_space_only():
     """A gap of half a metre is narrower than it flies through; a look in vain does not change that."""
     assert after_looking(before_a_strip(gap_m=1.2)).forward_m_s > 0.1
     command = after_looking(before_a_strip(gap_m=0.5))

@@ -1,4 +1,4 @@
-"""A second look at what looked like an opening from one place."""
+"""Second looks at candidate openings."""
 
 import math
 
@@ -32,7 +32,7 @@ def wanted(look, layer, here=(0.5, 1.0), now_s=0.0):
     return layer.centres(look.goals(layer, at(*here, now_s))).reshape(-1, 2)
 
 
-def test_what_is_on_the_way_is_near():
+def test_goals_on_the_way_are_near():
     look = considering(DOOR)
     near = room().centres(look.on_the_way(room(), at(1.2, -0.5)))
     assert len(near)
@@ -47,7 +47,7 @@ def considering(*candidates):
 
 
 @pytest.mark.parametrize("turned", [1.0, -1.0], ids=["normal away", "normal towards"])
-def test_it_looks_from_before_the_opening_and_elsewhere(turned):
+def test_viewpoints_are_in_front_and_away_from_the_first(turned):
     places = wanted(considering(Candidate(DOOR.centre_w, turned * DOOR.normal_w, DOOR.place_w)), room())
     assert len(places)
     look = considering(DOOR)
@@ -62,7 +62,7 @@ def test_it_looks_from_before_the_opening_and_elsewhere(turned):
     assert np.linalg.norm(places - DOOR.place_w, axis=1).min() >= 0.6
 
 
-def test_no_place_that_nothing_leads_to():
+def test_unreachable_viewpoints_are_excluded():
     fence = room(lambda x, y: np.abs(x - 0.8) < 0.1)
     assert len(wanted(considering(DOOR), fence)) == 0
     table = room(lambda x, y: (np.abs(x - 1.3) < 0.1) & (np.abs(y) < 0.1))
@@ -78,7 +78,7 @@ def test_it_stands_and_looks_at_the_opening_for_seconds():
     assert len(wanted(look, room(), now_s=5.2)) == 0, "nor is it flown to once more"
 
 
-def test_a_place_that_it_does_not_come_to_is_given_up():
+def test_unreached_viewpoint_is_given_up():
     look = considering(DOOR)
     assert len(wanted(look, room(), now_s=10.0))
     assert len(wanted(look, room(), now_s=39.0))
@@ -88,7 +88,7 @@ def test_a_place_that_it_does_not_come_to_is_given_up():
     assert len(wanted(look, room(), now_s=42.0)), "another one is not"
 
 
-def test_what_was_tried_goes_along_with_the_map():
+def test_looks_follow_map_corrections():
     """Metres become twice as long: what was given up at 3 m is at 6."""
     look = considering(DOOR)
     look.heading_rad(at(1.8, -0.3, 0.0))
@@ -100,7 +100,7 @@ def test_what_was_tried_goes_along_with_the_map():
     assert look.heading_rad(at(1.8, -0.3, 5.0)) is not None
 
 
-def test_what_was_seen_in_a_glimpse_may_be_looked_at_from_where_that_was():
+def test_hypothesis_may_be_viewed_from_its_first_viewpoint():
     """In a corridor of two metres there is no other place before a door."""
     before = np.array([1.8, 0.0])
     assert considering(Candidate(DOOR.centre_w, DOOR.normal_w, before)).heading_rad(at(*before)) is None
@@ -109,7 +109,7 @@ def test_what_was_seen_in_a_glimpse_may_be_looked_at_from_where_that_was():
     assert np.linalg.norm(wanted(hypotheses, room()) - before, axis=1).min() < 0.1
 
 
-def test_what_a_look_left_in_doubt_is_looked_at_from_elsewhere_twice_more():
+def test_unconfirmed_candidate_gets_two_more_looks():
     look, stood = considering(DOOR), []
     for k in range(4):
         look.once_more(10.0 * k)
@@ -125,7 +125,7 @@ def test_what_a_look_left_in_doubt_is_looked_at_from_elsewhere_twice_more():
     assert len(stood) == 3
 
 
-def test_what_no_way_led_to_is_not_tried_once_more():
+def test_unreached_candidate_is_not_retried():
     look = considering(DOOR)
     assert len(wanted(look, room(), now_s=0.0))
     look.once_more(31.0)
@@ -144,7 +144,7 @@ def goals(task, layer, x, y, now_s=0.0):
     return layer.centres(task.goals(layer, at(x, y, now_s))).reshape(-1, 2)
 
 
-def test_exploring_flies_to_borders_walls_and_doubts_whichever_is_near():
+def test_exploration_visits_frontiers_walls_and_candidates():
     door = Candidate(np.array([0.5, 0.0]), np.array([-1.0, 0.0]), np.array([2.0, 1.5]))
     task = Explore()
     task.consider([door])
@@ -154,7 +154,7 @@ def test_exploring_flies_to_borders_walls_and_doubts_whichever_is_near():
     assert goals(task, plain(5.0), 2.2, 0.0, 0.5)[:, 0].max() < 2.6, "the door alone where it is on the way"
 
 
-def test_exploring_looks_at_every_wall_from_before_and_then_ends():
+def test_exploration_covers_every_wall_and_ends():
     """A drone that is at its goal at once; of the border of the unseen it sees no more."""
     task, layer, x, y, yaw = Explore(), plain(5.0), 2.0, 0.0, 0.0
     for now_s in np.arange(0.0, 400.0, 0.1):
@@ -190,7 +190,7 @@ class Nothing:
         return np.zeros((0, 2), int)
 
 
-def test_exploring_looks_once_more_at_what_is_in_doubt_when_nothing_else_is_left():
+def test_exploration_revisits_candidates_last():
     task = Explore()
     task._around = Nothing()
     task.consider([DOOR])

@@ -1,4 +1,4 @@
-"""Free space from depth: what is before a wall, the wall, and what nobody has seen."""
+"""Occupancy grid from depth: free, occupied and unknown space."""
 
 from dataclasses import replace
 
@@ -22,11 +22,11 @@ def cell(layer, x, y):
     return bool(layer.free[i, j]), bool(layer.solid[i, j])
 
 
-def test_nothing_is_free_before_it_was_seen():
+def test_unknown_space_is_not_free():
     assert not Space().layer(1.15, 0.15).free.any()
 
 
-def test_before_a_wall_is_free_in_it_solid_behind_it_unseen():
+def test_wall_is_occupied_front_free_back_unknown():
     layer = seen(Space())
     assert cell(layer, 1.55, 0.05) == (True, False)
     assert cell(layer, 2.05, 0.05)[1] or cell(layer, 1.95, 0.05)[1]
@@ -35,7 +35,7 @@ def test_before_a_wall_is_free_in_it_solid_behind_it_unseen():
     assert cell(layer, -1.0, 0.05) == (False, False)  # behind the camera
 
 
-def test_depth_frees_only_two_sigmas_before_what_it_shows():
+def test_rays_free_up_to_two_sigmas_before_their_end():
     """A depth of 2 m within 20 % may be 1.34 m: nothing beyond that is free."""
     layer = seen(Space(), sigma=0.2)
     line = np.array([[x, 0.05] for x in np.arange(0.55, 2.0, 0.1)])
@@ -44,7 +44,7 @@ def test_depth_frees_only_two_sigmas_before_what_it_shows():
     assert 1.1 < farthest < 2.0 * np.exp(-0.4)
 
 
-def test_a_thin_thing_is_not_carved_away_by_what_is_behind_it():
+def test_thin_obstacle_survives_its_background():
     space = Space()
     view = facing_a_wall(4.0)
     view.depth_m[:, 39:41] = 1.55  # a rod of two pixels: 4 cm
@@ -71,7 +71,7 @@ def test_a_point_in_a_fine_picture_keeps_its_own_sigma_when_the_picture_is_made_
     assert cell(layer, *at)[1]
 
 
-def test_a_ramp_between_something_near_and_the_wall_behind_it_fills_nothing():
+def test_depth_ramp_marks_nothing():
     """A network draws no edge but a ramp: a door's frame at 1 m, and the room behind it."""
     view = facing_a_wall(3.0)
     view.depth_m[:, :30] = 1.0
@@ -102,7 +102,7 @@ def test_a_wall_along_the_way_is_no_ramp(side_m):
     assert all(any(cell(layer, x, side_m + off)[1] for off in (-1e-3, 1e-3)) for x in seen_m)
 
 
-def test_where_it_flew_is_free():
+def test_path_flown_is_free():
     space = Space()
     space.flown(np.array([0.5, 0.5, 1.15]), 0.2)
     layer = space.layer(1.15, 0.05)
@@ -110,7 +110,7 @@ def test_where_it_flew_is_free():
     assert not cell(layer, 1.0, 0.5)[0]
 
 
-def test_it_bends_with_the_map():
+def test_grid_follows_map_corrections():
     space = Space()
     seen(space)
     space.rebuild(MapUpdate(facing_a_wall().T_w_c[None], facing_a_wall(x=1.0).T_w_c[None]))
@@ -120,7 +120,7 @@ def test_it_bends_with_the_map():
     assert not cell(layer, 0.55, 0.05)[0]
 
 
-def test_it_grows_with_the_unit():
+def test_grid_follows_scale_changes():
     """Metres of 2 m become 1.5 times as long: the wall is 3 m away, and a place flown through 1 m to the side 1.5 m."""
     space = Space()
     seen(space)
@@ -134,7 +134,7 @@ def test_it_grows_with_the_unit():
     assert cell(layer, 0.05, 1.55)[0] and not cell(layer, 0.05, 1.05)[0]
 
 
-def test_what_it_hovers_before_fills_no_memory_and_what_it_passed_is_kept():
+def test_redundant_views_are_dropped():
     space = Space()
     for k in range(300):
         space.observe(facing_a_wall(x=0.01 * min(k, 100)))
@@ -144,8 +144,8 @@ def test_what_it_hovers_before_fills_no_memory_and_what_it_passed_is_kept():
     assert cell(layer, 0.75, 0.05) == (True, False) and cell(layer, 1.55, 0.05) == (True, False)
 
 
-def test_a_doubted_wall_is_unseen_until_it_is_seen_again_also_after_the_map_moved():
-    """Before it is free all the while, and nobody frees it."""
+def test_reset_wall_stays_unknown_until_observed_again():
+    """The space in front stays free, the wall is not freed."""
     space, update = Space(), MapUpdate(facing_a_wall().T_w_c[None], facing_a_wall(x=1.0).T_w_c[None])
     seen(space)
     space.doubt_solids()
@@ -160,7 +160,7 @@ def test_a_doubted_wall_is_unseen_until_it_is_seen_again_also_after_the_map_move
     assert space.layer(1.15, 0.15).solid.any(), "what was seen again stays"
 
 
-def test_it_follows_the_drone_and_keeps_what_it_knows():
+def test_grid_follows_the_drone():
     space = Space()
     before = cell(seen(space), 1.55, 0.05)
     space.follow(np.array([4.0, 0.0, 1.15]))
@@ -177,7 +177,7 @@ def test_points_of_the_map_are_solid():
     assert cell(layer, 1.05, 0.05) == (False, True)
 
 
-def test_unknown_depth_teaches_nothing():
+def test_unknown_depth_changes_nothing():
     space = Space()
     view = facing_a_wall()
     view.depth_m[:] = np.nan
@@ -191,7 +191,7 @@ def test_heights_outside_the_grid_are_refused():
         Space().layer(2.4, 0.2)
 
 
-def test_a_surface_without_a_sure_place_frees_and_fills_nothing_there():
+def test_uncertain_surface_stays_unknown():
     """2 m within 20 % is not an obstacle at 2 m: it may stand anywhere around, and stays unseen."""
     layer = seen(Space(), sigma=0.2)
     assert cell(layer, 1.0, 0.05) == (True, False)
@@ -199,7 +199,7 @@ def test_a_surface_without_a_sure_place_frees_and_fills_nothing_there():
     assert seen(Space(), sigma=0.1).solid.any()
 
 
-def test_what_was_touched_is_solid_whatever_is_seen():
+def test_contact_stays_occupied():
     space = Space()
     layer = seen(space, distance_m=4.0)
     assert cell(layer, 1.22, 0.05) == (True, False)
@@ -210,7 +210,7 @@ def test_what_was_touched_is_solid_whatever_is_seen():
     assert cell(layer, 1.05, 0.25) == (True, False), "not beside it"
 
 
-def test_what_was_touched_moves_with_the_map():
+def test_contacts_follow_map_corrections():
     space = Space()
     space.add_contact(Contact(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
     T = np.eye(4)[None]
@@ -221,13 +221,13 @@ def test_what_was_touched_moves_with_the_map():
     assert cell(layer, 2.22, 2.05)[1] and not cell(layer, 1.22, 0.05)[1]
 
 
-def test_a_touch_beyond_the_grid_is_no_error():
+def test_contact_outside_the_grid_is_ignored():
     space = Space()
     space.add_contact(Contact(np.array([100.0, 0.0, 1.15]), np.array([1.0, 0.0])), 0.17)
     assert not space.layer(1.15, 0.15).solid.any()
 
 
-def test_where_it_flew_is_known_as_the_grid_and_the_map_move():
+def test_path_flown_follows_grid_and_map():
     """Within a cell of it; after metres have become twice as long, twice as far away."""
     space = Space()
     for x in np.arange(0.05, 4.0, 0.1):
@@ -241,7 +241,7 @@ def test_where_it_flew_is_known_as_the_grid_and_the_map_move():
     assert not space.was_at(np.array([50.0, 0.0]))
 
 
-def test_what_was_seen_and_felt_before_a_moment_can_be_forgotten():
+def test_older_views_and_contacts_can_be_dropped():
     space = Space()
     for stamp_s, yaw in ((1.0, 0.0), (1.2, 0.0), (1.4, 0.0), (5.0, np.pi / 2), (5.2, np.pi / 2), (5.4, np.pi / 2)):
         space.observe(replace(facing_a_wall(yaw=yaw), stamp_s=stamp_s))

@@ -1,4 +1,4 @@
-"""What stands between a pilot and the sticks."""
+"""Supervisor between planner and sticks."""
 
 import math
 from dataclasses import replace
@@ -38,7 +38,7 @@ def test_a_healthy_flight_is_left_alone():
     assert all(o.command == AHEAD and not o.land and o.danger is Danger.NONE for o in orders)
 
 
-def test_a_pilot_that_hangs_gets_its_sticks_centred_then_the_drone_lands():
+def test_hanging_planner_centres_sticks_then_lands():
     supervisor = Supervisor()
     flown(supervisor, 1.0)
     orders = flown(supervisor, LAND_S + 1.0, command=None, begin_s=1.0)
@@ -48,7 +48,7 @@ def test_a_pilot_that_hangs_gets_its_sticks_centred_then_the_drone_lands():
     assert not orders[150].land and orders[-1].land
 
 
-def test_an_old_picture_stops_it_and_it_backs_up_the_way_it_came():
+def test_stale_frame_stops_and_backs_up():
     supervisor = Supervisor()
     flown(supervisor, 3.0)
     blind = flown(
@@ -74,7 +74,7 @@ def test_an_old_picture_stops_it_and_it_backs_up_the_way_it_came():
         ({"metric": False}, Danger.NOT_METRIC),
     ],
 )
-def test_doubt_stops_it(spoilt, danger):
+def test_dangers_stop_the_drone(spoilt, danger):
     supervisor = Supervisor()
     flown(supervisor, 1.0)
     orders = flown(supervisor, 1.0, lambda s: replace(s, **spoilt), begin_s=1.0)
@@ -82,7 +82,7 @@ def test_doubt_stops_it(spoilt, danger):
     assert all(o.command.forward_m_s == 0.0 for o in orders)
 
 
-def test_telemetry_carries_it_past_what_shows_nothing_as_long_as_it_is_sure_of_its_place():
+def test_dead_reckoning_continues_while_the_position_is_certain():
     supervisor = Supervisor()
     flown(supervisor, 1.0)
     carried = {"tracked": False, "position_sigma_m": 0.1}
@@ -94,8 +94,8 @@ def test_telemetry_carries_it_past_what_shows_nothing_as_long_as_it_is_sure_of_i
     assert {o.danger for o in waiting} == {Danger.LOST}  # it turns to what it may not know either
 
 
-def test_it_backs_up_to_where_it_was_sure_and_a_metre_farther():
-    """Its pose was lost at 1 m and carried on to 2 m."""
+def test_backs_up_a_metre_beyond_the_last_tracked_position():
+    """Tracking was lost at 1 m; dead reckoning led to 2 m."""
     supervisor = Supervisor()
     flown(supervisor, 2.0)
     flown(supervisor, 2.0, lambda s: replace(s, tracked=False, position_sigma_m=0.1), begin_s=2.0, x=1.0)
@@ -112,7 +112,7 @@ def test_it_backs_up_to_where_it_was_sure_and_a_metre_farther():
     assert max(o.command.forward_m_s for o in commands) <= 0.0
 
 
-def test_it_backs_up_although_it_has_drifted_beside_its_way():
+def test_backs_up_despite_lateral_drift():
     """By more than the steps in which the way is kept, half a metre back: onto it, and not forward to its end."""
     supervisor = Supervisor()
     flown(supervisor, 3.0)
@@ -122,7 +122,7 @@ def test_it_backs_up_although_it_has_drifted_beside_its_way():
     assert lost[-1].command.forward_m_s < 1e-6
 
 
-def test_on_its_way_home_it_backs_up_the_way_it_came_not_the_way_it_had_gone():
+def test_backs_up_along_the_latest_pass():
     """Out to 3 m and back to 1 m beside that, then a bare wall: back towards 3 m, where its pose was known last."""
     supervisor = Supervisor()
     flown(supervisor, 6.0)
@@ -136,8 +136,8 @@ def test_on_its_way_home_it_backs_up_the_way_it_came_not_the_way_it_had_gone():
     assert backing and all(command.forward_m_s > 0.1 for command in backing)
 
 
-def test_telemetry_tells_how_far_it_backed_up():
-    """In whole decimetres a second, cut off, with half a step added: one speed would be told up to half of it wrong."""
+def test_backing_up_speed_is_dithered():
+    """Truncated to whole dm/s with half a step added, a constant speed would be wrong by up to half a step."""
     supervisor = Supervisor()
     flown(supervisor, 6.0)
     stays = {"p_w": np.array([2.9, 0.0, 1.1]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
@@ -149,8 +149,8 @@ def test_telemetry_tells_how_far_it_backed_up():
     assert sum(speeds) / len(speeds) == pytest.approx(0.25, abs=0.01)
 
 
-def test_without_a_picture_it_moves_in_no_direction_that_telemetry_does_not_tell():
-    """A few centimetres beside its way it does not creep towards it, which would be told as standing."""
+def test_backing_up_avoids_velocities_below_the_quantisation_step():
+    """A few centimetres beside the path it does not creep back, which telemetry would report as standing."""
     supervisor = Supervisor()
     flown(supervisor, 3.0)
     aside = {"p_w": np.array([0.975, 0.03, 1.1]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
@@ -159,7 +159,7 @@ def test_without_a_picture_it_moves_in_no_direction_that_telemetry_does_not_tell
     assert backing and all(command.left_m_s == 0.0 and command.forward_m_s < -0.15 for command in backing)
 
 
-def test_a_pose_lost_in_a_turn_is_looked_for_where_it_was_known():
+def test_tracking_loss_in_a_turn_turns_back():
     """It turned left from 0, and lost the map at 45 degrees: it turns right again, back to what it saw before."""
     supervisor = Supervisor()
     yaw, turns = 0.0, []
@@ -173,7 +173,7 @@ def test_a_pose_lost_in_a_turn_is_looked_for_where_it_was_known():
     assert yaw == pytest.approx(math.radians(45.0 * (30 - 24) / 30), abs=math.radians(5.0))
 
 
-def test_doubtful_metres_make_it_rise_and_sink_but_not_leave_its_heights():
+def test_uncertain_scale_oscillates_within_height_limits():
     supervisor = Supervisor(NavLimits(highest_m=1.15))
     orders = flown(supervisor, 5.0, lambda s: replace(s, metric=False))
     up = [o.command.up_m_s for o in orders]
@@ -193,8 +193,8 @@ def test_commanded_and_not_moving_is_a_contact_and_lands_in_the_end():
     assert held[-1].land
 
 
-def test_what_holds_the_drone_is_told_once_with_its_direction():
-    """It looks along y and is told to go left: along -x."""
+def test_contact_is_reported_once_with_its_direction():
+    """Heading along y with a command to the left: along -x."""
     supervisor = Supervisor()
     still = {"p_w": np.array([0.5, 0, 1.1]), "velocity_w": np.zeros(3), "yaw_rad": math.pi / 2}
     contacts = []
@@ -208,7 +208,7 @@ def test_what_holds_the_drone_is_told_once_with_its_direction():
     np.testing.assert_allclose(contact.towards_w, [-1.0, 0.0], atol=1e-9)
 
 
-def test_a_drone_that_is_told_to_wait_is_not_held():
+def test_overridden_command_is_no_contact():
     """Metres are not sure: it goes up and down whatever the pilot commands, and that is no contact."""
     supervisor = Supervisor()
     flown(supervisor, 1.0)
@@ -227,7 +227,7 @@ def test_battery_calls_home_and_then_lands():
     assert flown(empty, 0.2, begin_s=0.2)[-1].land  # once it lands, it lands
 
 
-def test_the_fence_stops_what_leads_out_and_lets_it_return():
+def test_fence_blocks_outward_commands_only():
     limits = NavLimits(fence_m=2.0)
     out = Supervisor(limits)
     flown(out, 1.0)
@@ -237,7 +237,7 @@ def test_the_fence_stops_what_leads_out_and_lets_it_return():
     assert back[-1].danger is Danger.NONE
 
 
-def test_before_it_sees_anything_it_does_nothing():
+def test_no_state_hovers():
     order = Supervisor().order(0.0)
     assert order.command.sticks() == (0.0, 0.0, 0.0, 0.0) and not order.land
 
@@ -255,21 +255,21 @@ def test_heights_are_kept():
     assert math.isclose(flown(Supervisor(limits), 0.5, command=VelocityCommand(up_m_s=0.3))[-1].command.up_m_s, 0.3)
 
 
-def test_doubtful_metres_have_longer_to_mend_and_still_end_in_a_landing():
+def test_uncertain_scale_lands_later():
     orders = flown(Supervisor(), UNSURE_LAND_S + 1.0, lambda s: replace(s, metric=False, p_w=np.array([0.0, 0.0, 1.1])))
     assert not any(o.land for o in orders[: round(20 * UNSURE_LAND_S) - 1]) and orders[-1].land
     up = [o.command.up_m_s for o in orders[:-30]]
     assert min(up) < 0 < max(up) and abs(sum(up)) < 41 * max(up), "up and down about where it was"
 
 
-def test_an_old_picture_after_a_wait_for_metres_does_not_land_at_once():
+def test_stale_frame_after_uncertain_scale_does_not_land_at_once():
     supervisor = Supervisor()
     flown(supervisor, 12.0, lambda s: replace(s, scale_sigma=0.3))
     late = flown(supervisor, 1.0, lambda s: replace(s, seen_s=s.stamp_s - 1.0), begin_s=12.0)
     assert {o.danger for o in late} == {Danger.BLIND} and not any(o.land for o in late)
 
 
-def test_troubles_that_take_turns_end_in_a_landing_too():
+def test_alternating_dangers_land():
     supervisor = Supervisor()
 
     def turns(s):
@@ -279,7 +279,7 @@ def test_troubles_that_take_turns_end_in_a_landing_too():
     assert not orders[round(20 * (LAND_S + 2.0))].land and orders[-1].land
 
 
-def test_heights_of_a_map_without_metres_are_not_believed_when_the_drone_tells_its_own():
+def test_reported_height_replaces_non_metric_map_height():
     def low_by_a_map(s):
         return replace(s, metric=False, p_w=np.array([0.0, 0.0, 0.3]), reported_height_m=2.0)
 
@@ -287,7 +287,7 @@ def test_heights_of_a_map_without_metres_are_not_believed_when_the_drone_tells_i
     assert max(up) <= 0.0 and min(up) < -0.1, "2 m by its own word: down, whatever the map calls 0.3"
 
 
-def test_a_map_that_is_sure_and_at_another_height_than_the_drone_is_not_flown_by():
+def test_height_conflict_stops_the_drone():
     """At a wall without corners the pose sank by 0.5 m while the drone rose by 0.9 m, every frame tracked."""
     supervisor = Supervisor()
     flown(supervisor, 2.0, lambda s: replace(s, reported_height_m=1.4))
@@ -298,13 +298,13 @@ def test_a_map_that_is_sure_and_at_another_height_than_the_drone_is_not_flown_by
     assert orders[-1].land
 
 
-def test_heights_apart_mean_nothing_while_metres_are_not_sure():
+def test_no_height_conflict_while_scale_is_uncertain():
     orders = flown(Supervisor(), 3.0, lambda s: replace(s, reported_height_m=1.9, scale_sigma=0.2))
     assert {o.danger for o in orders} == {Danger.SCALE}
 
 
 def test_neither_height_may_be_beyond_the_limits():
-    """The map says 1.2 m, the drone 2.0 m: it rises no more, and sinks if it wants to."""
+    """The map says 1.2 m, the drone 2.0 m: it may sink but not rise."""
     rising = flown(Supervisor(), 0.5, lambda s: replace(s, reported_height_m=2.0), command=VelocityCommand(up_m_s=0.3))
     assert all(o.command.up_m_s == 0.0 for o in rising)
     sinking = flown(
@@ -313,7 +313,7 @@ def test_neither_height_may_be_beyond_the_limits():
     assert all(o.command.up_m_s == -0.3 for o in sinking)
 
 
-def test_a_way_back_that_something_stands_in_is_given_up_and_told():
+def test_blocked_way_back_is_given_up_and_reported():
     """It backs up by .25 m/s for a second and a half, and its own velocities say that it stands."""
     supervisor = Supervisor()
     flown(supervisor, 3.0)
@@ -328,7 +328,7 @@ def test_a_way_back_that_something_stands_in_is_given_up_and_told():
     assert not any(o.land for o in lost)
 
 
-def test_metres_that_change_while_it_is_carried_are_no_way_flown():
+def test_scale_change_is_no_dead_reckoned_distance():
     """Carried by half a metre, which become a whole one: it backs up by 2 m, in 8 s, not by 3.5."""
     supervisor = Supervisor()
     flown(supervisor, 2.0)
@@ -340,7 +340,7 @@ def test_metres_that_change_while_it_is_carried_are_no_way_flown():
     assert sum(backing) / 20 == pytest.approx(8.0, abs=0.3)
 
 
-def test_the_way_back_goes_along_with_the_map():
+def test_way_back_follows_map_corrections():
     """Metres become twice as long: the drone that was 1.5 m from its start is 3 m away, and backs up."""
     supervisor = Supervisor()
     flown(supervisor, 3.0)

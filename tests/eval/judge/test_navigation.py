@@ -108,7 +108,7 @@ def view_of(depth_m, sigma=0.01):
     return View(0.0, np.asarray(depth_m, np.float32), np.full((90, 120), sigma, np.float32), K, np.eye(4))
 
 
-def test_sectors_in_which_a_near_thing_is_told_to_be_far_are_counted():
+def test_sectors_with_overestimated_depth_are_counted():
     """A post of 3 columns at 0.7 m, before a wall at 3 m: seen, missed, or missed within its sigma."""
     true = np.full((90, 120), 3.0, np.float32)
     true[:, 50:53] = 0.7

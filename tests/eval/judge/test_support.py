@@ -22,7 +22,7 @@ def ended(p_w):
     return at_end(ROWS, np.tile(np.eye(4), (len(ROWS), 1, 1)), p_w, CAMERA).tolist()
 
 
-def test_live_support_is_told_by_the_status():
+def test_live_support_follows_the_status():
     assert live(ROWS).tolist() == [False, False, True, False, True, False]
 
 

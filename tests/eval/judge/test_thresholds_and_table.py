@@ -45,7 +45,7 @@ def test_figure_that_is_missing_does_not_pass(thresholds):
     assert [v.ok for v in verdicts_of_cell("desk", [row("desk", ate_m=0.01)], thresholds)] == [True, False]
 
 
-def test_variant_is_held_against_the_median_of_its_base(thresholds):
+def test_variant_is_compared_with_the_median_of_its_base(thresholds):
     base = [row("desk", seed, ate_m=ate) for seed, ate in enumerate((0.01, 0.02, 0.05))]
     near, far = row("desk/half_rate", ate_m=0.06), row("desk/half_size", ate_m=0.061)
     assert verdicts_of_cell("desk/half_rate", [*base, near], thresholds)[0].ok

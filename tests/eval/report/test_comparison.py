@@ -77,7 +77,7 @@ def test_figures_and_their_difference(two: tuple[Path, Path], tmp_path: Path) ->
     assert "seed" not in rows
 
 
-def test_one_path_is_laid_on_the_other(two: tuple[Path, Path], tmp_path: Path) -> None:
+def test_one_path_is_aligned_to_the_other(two: tuple[Path, Path], tmp_path: Path) -> None:
     text = Cells(write_comparison(*two, tmp_path / "c.html")).text
     found = re.search(
         r"B is aligned to A by (\d+) common frames .* scaled by ([\d.]+)\); .* distance is (\S+) m RMS", text
