@@ -118,7 +118,7 @@ def test_backs_up_despite_lateral_drift():
     flown(supervisor, 3.0)
     aside = {"p_w": np.array([0.975, 0.2, 1.1]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
     lost = flown(supervisor, 4.0, lambda s: replace(s, **aside), begin_s=3.0)
-    assert lost[-1].command.why.endswith("back the way it came") and lost[-1].command.left_m_s < 0.0
+    assert lost[-1].command.why.endswith("back up along the path flown") and lost[-1].command.left_m_s < 0.0
     assert lost[-1].command.forward_m_s < 1e-6
 
 
@@ -132,7 +132,7 @@ def test_backs_up_along_the_latest_pass():
         supervisor.order(6.0 + k / 20)
     stays = {"p_w": np.array([1.0, 0.1, 1.1]), "velocity_w": -BACK, "tracked": False, "position_sigma_m": 0.2}
     lost = flown(supervisor, 4.0, lambda s: replace(s, **stays), begin_s=10.0)
-    backing = [o.command for o in lost if o.command.why.endswith("back the way it came")]
+    backing = [o.command for o in lost if o.command.why.endswith("back up along the path flown")]
     assert backing and all(command.forward_m_s > 0.1 for command in backing)
 
 
@@ -142,7 +142,7 @@ def test_backing_up_speed_is_dithered():
     flown(supervisor, 6.0)
     stays = {"p_w": np.array([2.9, 0.0, 1.1]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
     lost = flown(supervisor, 5.45, lambda s: replace(s, **stays), begin_s=6.0)
-    speeds = [-o.command.forward_m_s for o in lost if o.command.why.endswith("back the way it came")][:80]
+    speeds = [-o.command.forward_m_s for o in lost if o.command.why.endswith("back up along the path flown")][:80]
     assert len(speeds) >= 75
     told = [math.floor(10.0 * v) / 10.0 + 0.05 for v in speeds]
     assert sum(told) == pytest.approx(sum(speeds), rel=0.03)
@@ -155,7 +155,7 @@ def test_backing_up_avoids_velocities_below_the_quantisation_step():
     flown(supervisor, 3.0)
     aside = {"p_w": np.array([0.975, 0.03, 1.1]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
     lost = flown(supervisor, 4.0, lambda s: replace(s, **aside), begin_s=3.0)
-    backing = [o.command for o in lost if o.command.why.endswith("back the way it came")]
+    backing = [o.command for o in lost if o.command.why.endswith("back up along the path flown")]
     assert backing and all(command.left_m_s == 0.0 and command.forward_m_s < -0.15 for command in backing)
 
 
@@ -321,7 +321,7 @@ def test_blocked_way_back_is_given_up_and_reported():
     lost = flown(
         supervisor, 9.0, lambda s: replace(s, **here, position_sigma_m=0.2), begin_s=3.0, command=VelocityCommand()
     )
-    backing = [o.command.why.endswith("back the way it came") for o in lost]
+    backing = [o.command.why.endswith("back up along the path flown") for o in lost]
     assert sum(backing) / 20 == pytest.approx(1.55, abs=0.1)
     (contact,) = [o.contact for o in lost if o.contact is not None]
     np.testing.assert_allclose(contact.towards_w, [-1.0, 0.0], atol=0.2)
@@ -336,7 +336,7 @@ def test_scale_change_is_no_dead_reckoned_distance():
     supervisor.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None], 2.0))
     there = {"p_w": np.array([2.95, 0.0, 2.2]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
     lost = flown(supervisor, 11.0, lambda s: replace(s, **there), command=VelocityCommand(), begin_s=3.0)
-    backing = [o.command.why.endswith("back the way it came") for o in lost]
+    backing = [o.command.why.endswith("back up along the path flown") for o in lost]
     assert sum(backing) / 20 == pytest.approx(8.0, abs=0.3)
 
 
