@@ -347,13 +347,13 @@ class Health:
     filtering: bool = False
     """Whether the Kalman filter predicts the pose: `EdgeSlam.pose_now` makes up for the delay."""
     doubts: tuple[str, ...] = ()
-    """What is not used, and why, in sentences."""
+    """Warnings about sources that are not used."""
     submap_sigma: float = 0.0
-    """Standard deviation per axis of the newest pose against the piece of map in which the flight began [published
-    unit]: what the drone's sensors leave open that carried the camera from one to the other. 0 in one map."""
+    """Standard deviation per axis of the newest pose relative to the flight's first submap [published unit], by the
+    drone's sensors that relate the two; 0 in the first one, infinite if unrelated."""
     drift_sigma: float = 0.0
-    """The same of what its map may have drifted by since the first frame: it grows with the way, and shrinks where a
-    place is known again. That metres themselves are unsure (`scale`) comes on top."""
+    """Standard deviation per axis of the map's drift since the first frame: it grows with the path, and shrinks at a
+    revisit. The uncertainty of the scale (`scale`) comes on top."""
 
     @property
     def home_sigma(self) -> float:
@@ -361,17 +361,17 @@ class Health:
         return float(np.hypot(self.submap_sigma, self.drift_sigma))
 
     def __str__(self) -> str:
-        """For a status line: metres, disagreement, telemetry and battery, as far as there is something to say."""
+        """Status line: metric scale, disagreement, telemetry and battery."""
         relative = self.scale.sigma / self.scale.value
         words = [f"metres to {100.0 * relative:.0f} %" if self.metric else "no metres"]
         if self.disagreement > DISAGREEMENT:
-            words.append(f"sources {self.disagreement:.0f} sigmas apart")
+            words.append(f"sources differ by {self.disagreement:.0f} sigmas")
         if np.isinf(self.submap_sigma):
-            words.append("nothing relates this piece of map to where the flight began")
+            words.append("submap unrelated to where the flight began")
         elif self.submap_sigma > 0:
-            words.append(f"{self.home_sigma:.2g} {'m' if self.metric else 'units'} unsure of where the flight began")
+            words.append(f"position sigma {self.home_sigma:.2g} {'m' if self.metric else 'units'} from the start")
         if SILENCE_S < self.telemetry_age_s < np.inf:
-            words.append(f"telemetry silent for {self.telemetry_age_s:.1f} s")
+            words.append(f"no telemetry for {self.telemetry_age_s:.1f} s")
         if np.isfinite(self.battery):
             words.append(f"battery {100.0 * self.battery:.0f} %")
         return ", ".join(words)

@@ -1,7 +1,7 @@
-"""A camera has a mass: what is known of its positions before anything is measured, once the map's unit is.
+"""Prior on camera positions from bounded acceleration, once the map has a metric scale.
 
-A keyframe that hangs on its neighbour by a few anchors, which nothing else sees, has no scale of its own: images allow
-it to be metres away, a tenth of a second before.
+A keyframe that shares few anchors with its neighbour, and these with no other, has no scale of its own: images allow it
+to be metres away a tenth of a second earlier.
 """
 
 import numpy as np
@@ -9,23 +9,22 @@ import numpy as np
 from edgeslam_torch.types import FloatArray
 
 ACCELERATION_M_S2 = 10.0
-"""Standard deviation of the acceleration along each axis: a g. Hands and drones of seven recordings have .2 to 1.7,
-6.6 at most. Counted thirty times in flight, as the rest of telemetry is, it is 1.8: still too weak to move what images
-hold."""
+"""Standard deviation of the acceleration along each axis, 1 g: weak against images; hands and drones have 0.2 to
+1.7."""
 LONGEST_S = 0.5
-"""Time between two pictures beyond which a camera may have stopped and set off again."""
+"""Maximum time between two frames; over longer gaps the camera may have stopped and restarted."""
 
 
 def inertia(stamps_s: FloatArray, metres: float) -> FloatArray | None:
-    """Information about positions from the limits of acceleration.
+    """Information on positions from the acceleration prior.
 
     Args:
-        stamps_s: Increasing stamps of the pictures ``(K,)``.
+        stamps_s: Increasing stamps of frames ``(K,)``.
         metres: Metres per map unit.
 
     Returns:
-        ``(3 K, 3 K)`` [1/unit^2] of the positions stacked as ``(K, 3)``: any even motion costs nothing. None where
-        no three pictures follow each other closely.
+        ``(3 K, 3 K)`` [1/unit^2] of the positions stacked as ``(K, 3)``; uniform motion has no cost. None without three
+        frames in close succession.
 
     >>> import numpy as np
     >>> still = inertia(np.array([0.0, 0.1, 0.3]), metres=2.0)

@@ -1,4 +1,4 @@
-"""Settings of the Kalman filter and of the metric scale; every number has its unit and its reason."""
+"""Settings of the Kalman filter and of the metric scale, with units and reasons."""
 
 import math
 from dataclasses import dataclass
@@ -54,17 +54,17 @@ class FusionConfig:
     literal_beta: float = 1e-3
     """The paper's beta, which there has the units of the whole covariance (m^2 and rad^2)."""
     sigma_velocity_m_s: float = 0.033
-    """Error of one velocity reading: 0.1 / sqrt(12) of quantisation and the drone's own 0.02."""
+    """Standard deviation of one velocity reading: 0.1 / sqrt(12) of quantisation and 0.02 of sensor noise."""
     sigma_attitude_rad: float = math.radians(0.36)
-    """Error of one attitude reading: 1 deg / sqrt(12) of quantisation that repeats while the drone hovers."""
+    """Standard deviation of one attitude reading: 1 deg / sqrt(12) of quantisation, which repeats in hover."""
     sigma_turn_rad_sqrt_s: float = 0.05
-    """Random walk of the angles between readings; fitted so that rotation errors match their covariance."""
+    """Random walk of the angles between readings; set so that rotation errors match their covariance."""
     sigma_bias_m_s: float = 0.03
-    """Velocity bias at the start (0 takes the bias out of the state: the paper's six states)."""
+    """Initial velocity bias (0 removes the bias from the state: the paper's six states)."""
     bias_walk_m_s_sqrt_s: float = 0.015
     """Random walk of the velocity bias, before the battery factor."""
     floor_position_m: float = 1e-3
-    """Least process noise [m/sqrt(s)]: keeps the covariance positive whatever the other settings are."""
+    """Minimum process noise [m/sqrt(s)], which keeps the covariance positive definite."""
     initial_sigma_position_m: float = 0.0
     """Standard deviation of the first position; 0, since it is the origin of the filter's world."""
     initial_sigma_angle_rad: float = math.radians(1.0)
@@ -74,25 +74,25 @@ class FusionConfig:
     refusals_before_recovery: int = 5
     """Refusals in a row after which the covariance is inflated and the measurement taken."""
     buffer_s: float = 3.0
-    """How far back a late measurement is still inserted in time order."""
+    """Maximum age of a late measurement that is still inserted in time order."""
     delay_s: float | None = None
     """Video delay behind telemetry [s]; ``None`` estimates it from the motion."""
     delay_range_s: tuple[float, float] = (-0.2, 1.2)
     """Range that is searched; a Tello's video is 0.3-0.8 s late."""
     interval_s: float = 0.5
-    """Length of one displacement: long against the pose noise, short against a hand's or drone's swing."""
+    """Length of one displacement: long against pose noise, short against the oscillation of a hand or drone."""
     window_s: float = 120.0
     """Age beyond which displacements are dropped."""
     max_gap_s: float = 0.35
-    """A longer hole in telemetry or tracking ends a displacement."""
+    """Maximum gap of telemetry or tracking inside a displacement."""
     alignment_sigma_rad: float = math.radians(3.0)
-    """Standard deviation of the camera's mount, per axis, until it is estimated from the flight's turns."""
+    """Standard deviation of the camera's mount, per axis, until it is estimated from rotations."""
     min_speed_m_s: float = 0.06
-    """RMS metric speed below which an interval does not constrain the scale (hover, turning on the spot)."""
+    """RMS metric speed below which an interval does not constrain the scale (hover, rotation in place)."""
     systematic_log: float = 0.008
-    """Scale error of the drone's own velocity that no averaging removes."""
+    """Systematic scale error of the drone's velocity, which averaging does not reduce."""
     height_systematic_log: float = 0.02
-    """The same of height, compared with a climb of decimetres: over that the map itself bends by a centimetre."""
+    """The same for heights over a climb of decimetres, along which the map bends by a centimetre."""
     truncation_systematic_log: float = 0.015
     """The same when readings are truncated: the mean remainder depends on an assumed noise."""
     sigma_tof_m: float = 0.015
@@ -102,7 +102,7 @@ class FusionConfig:
     sigma_baro_m: float = 0.15
     """Standard deviation of a reading of the barometer."""
     depth_bias_log: float = 0.1
-    """Scale error of the depth network that all keyframes of a scene share; the estimated part is added to it."""
+    """Scale error of the depth network common to all keyframes of a scene; the estimated part is added to it."""
 
     def __post_init__(self) -> None:
         for name in _POSITIVE:

@@ -1,7 +1,7 @@
-"""Where a camera is by dead reckoning: as the drone's sensors carry it on from the poses of the last seconds.
+"""Dead reckoning of the camera position from the poses of the last seconds.
 
-Sideways by its velocities, from where the last second's frames were; up and down by its height, which drifts less, from
-where those of five seconds were. An interval, not a Gaussian: what is inside is as likely as the images make it.
+Horizontally by velocities from the frames of the last second, vertically by height, which drifts less, from those of
+five seconds. The result is an interval, uniform inside, not a Gaussian.
 """
 
 import math
@@ -14,39 +14,39 @@ from edgeslam_torch.fusion.telemetry.visual_memory import Sightings
 from edgeslam_torch.types import FloatArray
 
 REACH_S = 5.0
-"""Time over which a height is compared with the map's."""
+"""Time over which heights are compared with the map."""
 _CARRIED_S = 1.0
-"""Time over which velocities carry the camera: whole decimetres a second lose as many decimetres in it."""
+"""Time over which velocities are integrated; quantisation of 0.1 m/s adds up to as many metres per second."""
 _STAMPED_S = 0.05
-"""Standard deviation of a message's moment: half of the time from one to the next."""
+"""Standard deviation of a message's stamp: half the message interval."""
 _NOISE_M = 0.05
-"""Three standard deviations of a range sensor's reading, and of a tracked pose beside its neighbours."""
+"""Three standard deviations of a range reading, and of a tracked position."""
 _STEP_M, _STEP_M_S = 0.08, 1.0
-"""Change between two heights that is the floor's: their noise, and more than twice as fast as a drone climbs."""
+"""Change between two heights that is a step of the floor: noise, and twice the maximum climb rate."""
 _HOLE_S = 0.5
 _FEW = 4
-"""Poses below which their height is not compared: a second of flight."""
+"""Minimum number of poses for a comparison of heights: a second of flight."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reckoned:
-    """A camera's place in the axes of the drone's power-on world."""
+    """Camera position in the axes of the drone's power-on world."""
 
     R_w_m: FloatArray
     """``(3, 3)`` map to those axes."""
     centre: FloatArray
     """``(3,)`` [map units]."""
     doubt: FloatArray
-    """``(3,)`` how far it may be off along each axis [map units]."""
+    """``(3,)`` maximum error along each axis [map units]."""
 
 
 def reckoned(model: TelemetryModel, recent: Sightings, stamp_s: float) -> Reckoned | None:
-    """Place of a frame's camera; None where telemetry does not cover the way to it.
+    """Position of a frame's camera; None where telemetry does not cover it.
 
     Args:
-        model: Telemetry, with velocities that may speak, and its tie to the map.
+        model: Telemetry with usable velocities, aligned with the map.
         recent: Tracked poses of the last `REACH_S`, at least one.
-        stamp_s: Of the frame.
+        stamp_s: Stamp of the frame.
     """
     late_s = math.hypot(model.delay_sigma_s, _STAMPED_S)
     frame_s = stamp_s - model.delay_s + np.array([0.0, -late_s, late_s])
@@ -73,9 +73,9 @@ def reckoned(model: TelemetryModel, recent: Sightings, stamp_s: float) -> Reckon
 def _by_height(
     model: TelemetryModel, stamps_s: FloatArray, seen: FloatArray, frame_s: FloatArray
 ) -> tuple[float, float] | None:
-    """The body's height at a moment and its doubt [m], by its heights ``(S,)`` on the map and the drone's own.
+    """The body's height at a moment and its maximum error [m], from its heights ``(S,)`` in the map and the drone's.
 
-    None where the drone tells none, or the floor has stepped since all but a few of them: furniture below.
+    None without heights, or after a step of the floor (furniture below) that leaves too few of them.
     """
     times_s, z = model.track.heights().get(model.height or "", (np.zeros(0), np.zeros(0)))
     lately = times_s >= stamps_s.min() - _HOLE_S
@@ -95,6 +95,6 @@ def _by_height(
 
 
 def _unsure(around: FloatArray, way: FloatArray, scale_sigma_log: float) -> FloatArray:
-    """Doubt about a frame's moment, by what was told ``(3, ...)`` for it and for the earliest and latest that it may
-    be, and about the scale of a way."""
+    """Maximum error from the uncertain stamp, by values ``(3, ...)`` at the nominal, earliest and latest stamp, and
+    from the uncertain scale."""
     return np.asarray(np.abs(around - around[0]).max(axis=0) + 2.0 * scale_sigma_log * way)

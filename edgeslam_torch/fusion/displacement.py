@@ -1,4 +1,4 @@
-r"""What telemetry says of a camera's positions at some moments, as a Gaussian with everything unknown marginalised.
+r"""Camera positions by telemetry as a Gaussian with nuisance parameters marginalised.
 
 All measurements are linear in the positions :math:`p_k` (world axes, map units):
 
@@ -6,11 +6,11 @@ All measurements are linear in the positions :math:`p_k` (world axes, map units)
     s\,(p_{k+1} - p_k) = d_k + \epsilon_k, \qquad s\,z_k + c = h_k + \eta_k
 
 with displacements :math:`d` from integrated velocities and heights :math:`h` above a floor whose level :math:`c`
-changes where furniture passes below. The errors are added up from what they are: noise of single readings; the interval
-of the rounding, whose error stays in part as long as its reading and else for a second; a velocity bias that decays in
-seconds; and, common to all, the scale, the map's tilt, the video's delay and whether the drone rounds or truncates.
-These nuisance parameters are columns of the covariance, so that the solver does not see them. The scale's column is the
-map's own way :math:`s\,p`: with :math:`d` in its place, a map that disagrees would cost less the smaller it is.
+changes where furniture passes below. The error model: noise of single readings; quantisation, part of whose error
+lasts as long as its reading and the rest for a second; a velocity bias that decays in seconds; and, common to all, the
+scale, the map's tilt, the video's delay and whether the drone rounds or truncates. These nuisance parameters are
+columns of the covariance, so that the solver does not see them. The scale's column is the map's own path :math:`s\,p`:
+with :math:`d` in its place, a map that disagrees would cost less the smaller it is.
 """
 
 import math
@@ -28,37 +28,36 @@ from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray, IntArray
 
 BIAS_M_S = 0.015
-"""Standard deviation of the velocity bias: the middle of what flights show (`joint_scale`)."""
+"""Standard deviation of the velocity bias, typical of flights (`joint_scale`)."""
 BIAS_MEMORY_S = 12.0
 _LASTING, _VARIES_S = 0.25, 1.0
-"""Share of a rounding error's variance that lasts as long as its reading, and time in which the rest changes [s]. In
-flights at speeds that vary by a step in two seconds the mean over a reading's three seconds and more is .01 m/s off;
-an error that lasted would be .029."""
+"""Share of a quantisation error's variance that lasts as long as its reading, and correlation time of the rest [s]. The
+mean error over a reading of three seconds is .01 m/s at varying speed; a constant one would be .029."""
 SENSOR_M_S = 0.02
-"""Noise of one velocity reading before it is rounded."""
+"""Noise of one velocity reading before quantisation."""
 HEIGHT_MEMORY_S = 3.0
-"""How long an error of SDK height or barometer lasts."""
+"""Correlation time of errors of SDK height and barometer."""
 TILT_RAD = math.radians(2.0)
-"""Error of the rotation from map to world: of the camera's mount, above all."""
+"""Error of the rotation from map to world, mostly of the camera's mount."""
 LONGEST_S = 10.0
-"""Time between two positions beyond which integrated velocity says too little of them."""
+"""Maximum time between two positions for integrated velocity."""
 DELAY_S = 0.3
-"""Standard deviation of a delay that nothing has told yet [s]."""
+"""Standard deviation of an unknown delay [s]."""
 FLOOR_M = 30.0
-"""Prior on the floor's level: none."""
+"""Uninformative prior on the floor's level."""
 UP_RAD = math.radians(2.0)
-"""Error of the direction of gravity in one picture: mount, accelerations in flight."""
+"""Error of the direction of gravity in one frame: mount, accelerations."""
 UP_MEMORY_S = 5.0
 _UNPROVEN_S = 3.0
-"""How far off the stamps of telemetry may be that has not yet turned with the images: `comparison` looks so far."""
+"""Range of delays to consider before telemetry is validated, as in `comparison`."""
 _STEADY_RAD = math.radians(15.0)
-"""Lean of a drone that takes off and flies slowly, at most; a camera in a hand rolls by more, and its attitude may be
-another moment's until it has proven otherwise."""
+"""Maximum lean of a drone that takes off and flies slowly. A hand-held camera rolls by more, and its unvalidated
+attitude may have the wrong stamp."""
 _STILL_M_S = 0.05
-"""Speed along an axis up to which a drone stands, whatever a map unit is: half a step of the SDK."""
+"""Speed along an axis below which the drone is at rest: half a step of the SDK; independent of the map's scale."""
 _LEAST_WEIGHT = 1e-4
 _BENT = 0.2
-"""Share of a way by which the map may be off without the reading being a wild one: that is what is to be mended."""
+"""Share of a path by which the map may be wrong without the reading being an outlier: that is to be corrected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,48 +70,48 @@ class PositionGaussian:
     """``(3 K,)``"""
     constant: float
     rows: int
-    """Measurements."""
+    """Number of measurements."""
     refused: int
-    """Of them, wild ones: beyond their sigmas and beyond what a bent map could explain."""
+    """Number of outliers: beyond their sigmas and beyond what a distorted map could explain."""
 
 
 @dataclass(frozen=True, slots=True)
 class UpDirections:
-    """Gravity in some pictures."""
+    """Direction of gravity in some frames."""
 
     frame: IntArray
-    """``(U,)`` which of the frames asked about."""
+    """``(U,)`` indices of the frames."""
     up_c: FloatArray
     """``(U, 3)`` unit vectors, camera axes."""
     up_m: FloatArray
     """``(3,)`` the same in the map."""
     sigma_rad: float
-    """Of each, per axis."""
+    """Standard deviation of each, per axis."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Rows:
-    """Linear measurements of positions in world axes [m]: ``D p`` should be ``told``."""
+    """Linear measurements of positions in world axes [m]: ``D p = told``."""
 
     D: FloatArray
     """``(M, K, 3)`` without the scale."""
     told: FloatArray
     """``(M,)``"""
     white: FloatArray
-    """``(M,)`` variances of what is independent."""
+    """``(M,)`` variances of independent errors."""
     slow: FloatArray
-    """``(M, M)`` covariance of what has a memory."""
+    """``(M, M)`` covariance of correlated errors."""
     common: FloatArray
     """``(M, C)`` change of ``told`` per standard deviation of each common nuisance parameter."""
     group: IntArray
-    """``(M,)`` rows that are one measurement."""
+    """``(M,)`` groups of rows that form one measurement."""
     way: FloatArray
-    """``(M,)`` length of what each row is about [m]."""
+    """``(M,)`` path length of each row [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class TelemetryModel:
-    """Telemetry as it is at one moment, and what ties it to the map."""
+    """Telemetry at one moment, and its alignment with the map."""
 
     track: TelemetryTrack
     config: FusionConfig
@@ -126,41 +125,41 @@ class TelemetryModel:
     scale_sigma_log: float
     """Infinite where only gravity is known."""
     velocity: bool
-    """Whether velocities may speak."""
+    """Whether velocities are usable."""
     height: str | None
-    """Name of the height that may speak, if any."""
+    """Name of the height in use, if any."""
     truncates: float
     """Probability that velocities are truncated, not rounded."""
     attitude: bool = True
-    """Whether attitude may speak."""
+    """Whether attitude is usable."""
     young: bool = False
-    """Whether the map has begun seconds ago."""
+    """Whether the map began seconds ago."""
     standing: bool = False
-    """Whether, where velocities may not speak, those of a drone that stands may: nothing is nothing in any unit."""
+    """Whether readings of a drone at rest are usable where velocities are not: zero is independent of the scale."""
 
     @property
     def knows_metres(self) -> bool:
-        """Whether more than gravity is known."""
+        """Whether the metric scale is known."""
         return math.isfinite(self.scale_sigma_log)
 
     @property
     def holds_level(self) -> bool:
-        """Whether attitude decides what turned and what moved: the map's depths are guesses still."""
+        """Whether attitude constrains the frames: the map still rests on predicted depths."""
         return self.young and not self.knows_metres
 
     def positions(
         self, stamps_s: FloatArray, p_m: FloatArray, scale_sigma_log: float | None = None
     ) -> PositionGaussian | None:
-        """What telemetry says of camera positions.
+        """Camera positions by telemetry.
 
         Args:
             stamps_s: Increasing stamps of frames ``(K,)``.
-            p_m: Positions in the map as it is ``(K, 3)`` [map units]: what single measurements are compared with, to
-                refuse those that disagree with the rest.
-            scale_sigma_log: Standard deviation of the scale's logarithm; the estimate's own when None.
+            p_m: Positions in the present map ``(K, 3)`` [map units], for rejecting single measurements that disagree
+                with the rest.
+            scale_sigma_log: Standard deviation of the scale's logarithm; the estimate's own if None.
 
         Returns:
-            The Gaussian, or None where telemetry is silent.
+            The Gaussian, or None without telemetry.
         """
         if len(stamps_s) < 2 or len(self.track) < 2 or not (self.velocity or self.standing or self.height is not None):
             return None
@@ -178,19 +177,19 @@ class TelemetryModel:
         return None if rows is None else self._gaussian(rows, p_m)
 
     def up(self, stamps_s: FloatArray) -> UpDirections | None:
-        """Gravity in frames at ``stamps_s`` ``(K,)``; None where no attitude is told."""
+        """Gravity in frames at ``stamps_s`` ``(K,)``; None without attitude."""
         if len(self.track) < 2 or not (self.attitude and self.track.has_attitude):
             return None
         at_s = stamps_s - self.delay_s
         use = self.track.covered(at_s, at_s)
-        if not self.knows_metres:  # half a degree of lean is motion to a map without parallax, and its depths run away
+        if not self.knows_metres:  # without parallax half a degree of lean looks like motion, and depths diverge
             use &= is_steady(self.track, at_s)
         frame = np.flatnonzero(use)
         if len(frame) == 0:
             return None
         t = at_s[frame]
         R_w_c = self.track.attitude(t) @ self.T_b_c[:3, :3]
-        # Neighbours err alike: together they count as one.
+        # Errors of neighbours are correlated: together they count as one.
         alike = (np.abs(t[:, None] - t[None]) < 0.5 * UP_MEMORY_S).sum(1)
         return UpDirections(frame, R_w_c[:, 2, :], self.R_w_m[2], UP_RAD * math.sqrt(float(np.median(alike))))
 
@@ -245,7 +244,7 @@ class TelemetryModel:
         )
 
     def _heights(self, at_s: FloatArray, per_scale_w: FloatArray) -> _Rows | None:
-        """Rows of the height that may speak; ``per_scale_w`` as in `_displacements`."""
+        """Rows of the height in use; ``per_scale_w`` as in `_displacements`."""
         name = self.height
         stamp, z = self.track.heights().get(name or "", (np.zeros(0), np.zeros(0)))
         if len(stamp) < 2:
@@ -280,13 +279,13 @@ class TelemetryModel:
         per_scale = per_scale_w[use, 2]
         per_scale = per_scale - (same @ per_scale) / same.sum(1)
         common = np.column_stack([per_scale, tilt, delay * fast, none])
-        rounded = name == "tof"  # centimetres; the others move in steps or wander
+        rounded = name == "tof"  # centimetres; the others move in steps or drift
         white = np.full(M, sigma**2 if rounded else 0.25 * sigma**2)
         slow = (0.1 if rounded else 1.0) * lasting + level
         return _Rows(D, h, white, slow, common, np.arange(M), np.abs(rise))
 
     def _gaussian(self, rows: _Rows, p_m: FloatArray) -> PositionGaussian:
-        """Marginalise, weigh out what disagrees with the rest, and turn to map axes."""
+        """Marginalise, reweight outliers, and rotate to map axes."""
         D = np.einsum("mkw,wv->mkv", rows.D, self.R_w_m).reshape(len(rows.told), -1) * self.scale
         residual = D @ p_m.ravel() - rows.told
         slow = rows.slow + rows.common @ rows.common.T
@@ -310,12 +309,12 @@ class TelemetryModel:
 
 
 def is_steady(track: TelemetryTrack, at_s: FloatArray) -> NDArray[np.bool_]:
-    """Whether a drone leans at moments ``(N,)`` as one that takes off does, whichever moment near by is meant."""
+    """Whether a drone leans no more than in take-off around moments ``(N,)``, for any plausible delay."""
     return np.asarray(track.leaned(at_s, _UNPROVEN_S) < _STEADY_RAD)
 
 
 def _still(rows: _Rows | None, at_s: FloatArray) -> _Rows | None:
-    """Of displacements between moments ``(K,)`` those along axes along which the drone stands."""
+    """Displacements between moments ``(K,)`` along axes along which the drone is at rest."""
     if rows is None:
         return None
     lasted_s = rows.D.sum(2) @ at_s
@@ -357,7 +356,7 @@ def _stacked(parts: list[_Rows]) -> _Rows | None:
 
 
 def _shares(stamp_s: FloatArray, start_s: FloatArray, end_s: FloatArray) -> FloatArray:
-    """Time [s] for which each reading stands in each interval ``(N, S)``: from half-way to its neighbours."""
+    """Time [s] for which each reading is valid in each interval ``(N, S)``: from half-way to its neighbours."""
     middle = 0.5 * (stamp_s[1:] + stamp_s[:-1])
     low, high = np.append(-np.inf, middle), np.append(middle, np.inf)
     overlap = np.minimum(end_s[:, None], high) - np.maximum(start_s[:, None], low)
@@ -367,14 +366,14 @@ def _shares(stamp_s: FloatArray, start_s: FloatArray, end_s: FloatArray) -> Floa
 def _runs(
     share: FloatArray, stamp_s: FloatArray, velocity: FloatArray, R_w: FloatArray, step_m_s: float, truncates: float
 ) -> FloatArray:
-    """Errors of displacements per standard deviation of each rounding error ``(3 N, runs)``.
+    """Errors of displacements per standard deviation of each quantisation error ``(3 N, runs)``.
 
-    A rounding error is uniform within the step, or, for a zero that may be a truncated one, within two steps. While a
-    reading stays the same a part of its error does, too, as at an even speed; the rest changes with the speed.
+    A quantisation error is uniform within the step, or within two steps for a zero that may be truncated. While a
+    reading stays the same a part of its error does as well; the rest changes with the speed.
 
     Args:
         share: From `_shares` ``(N, S)``.
-        stamp_s: Of the readings ``(S,)``.
+        stamp_s: Stamps of the readings ``(S,)``.
         velocity: Readings in the drone's own axes ``(S, 3)``.
         R_w: Those axes to world ``(S, 3, 3)``.
         step_m_s: The step.

@@ -1,9 +1,8 @@
-"""What telemetry says of a camera's headings at some moments, as a Gaussian with everything unknown marginalised.
+"""Headings by telemetry as a Gaussian with nuisance parameters marginalised.
 
-A drone's yaw is an integrated gyroscope: right from one keyframe to the next, and unknown as a whole. Its errors are
-added up from what they are: whole degrees; a rate of drift, the same for the flight; a share of each turn, by the
-gyroscope's and the camera's scale; the video's delay, which errs with the rate of the turn; and the offset between the
-map's axes and those of power-on.
+A drone's yaw is an integrated gyroscope: accurate between keyframes, with an unknown offset. Its error model:
+quantisation to whole degrees; a drift rate, constant over the flight; scale factors of gyroscope and camera; the
+video's delay times the yaw rate; and the offset between the map's axes and those of power-on.
 """
 
 import math
@@ -15,32 +14,32 @@ from edgeslam_torch.fusion.displacement import DELAY_S, TelemetryModel
 from edgeslam_torch.types import FloatArray, IntArray
 
 HEADING_RAD = math.radians(0.5)
-"""Error of one heading: whole degrees, and a camera's mount that is off in a turn."""
+"""Standard deviation of one heading: quantisation to whole degrees, and the error of the camera mount in a turn."""
 DRIFT_RAD_S = math.radians(0.02)
-"""Standard deviation of the rate at which a gyroscope drifts: a degree in a minute."""
+"""Standard deviation of the gyroscope's drift rate: a degree per minute."""
 TURN_SHARE = 0.005
-"""Standard deviation of a turn, relative: a gyroscope's scale and a focal length are known to half a percent."""
+"""Relative standard deviation of a rotation: scale factor of the gyroscope, error of the focal length."""
 _OFFSET_RAD = 1.0
 _RATE_S = 0.1
-"""Time over which the rate of a turn is taken."""
+"""Time over which the yaw rate is computed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Headings:
-    """Attitudes of some pictures, whose turn about the vertical is to be believed."""
+    """Headings of some frames."""
 
     frame: IntArray
-    """``(U,)`` which of the frames asked about."""
+    """``(U,)`` indices of the frames."""
     R_c_m: FloatArray
-    """``(U, 3, 3)`` map to camera, up to a common turn about the vertical."""
+    """``(U, 3, 3)`` map to camera, up to a common rotation about the vertical."""
     up_m: FloatArray
     """``(3,)`` the vertical in the map."""
     information: FloatArray
-    """``(U, U)`` of the errors about it [1/rad^2]; a common turn is not determined."""
+    """``(U, U)`` of the heading errors [1/rad^2]; a common rotation is not determined."""
 
 
 def headings(model: TelemetryModel, stamps_s: FloatArray) -> Headings | None:
-    """Headings of frames at increasing ``stamps_s`` ``(K,)``; None where no two are told, or no metres are known."""
+    """Headings of frames at increasing ``stamps_s`` ``(K,)``; None for fewer than two, or without metric scale."""
     at_s = stamps_s - model.delay_s
     told = model.knows_metres and model.attitude and model.track.has_attitude
     frame = np.flatnonzero(model.track.covered(at_s, at_s)) if told else np.zeros(0, dtype=np.int64)
@@ -54,7 +53,7 @@ def headings(model: TelemetryModel, stamps_s: FloatArray) -> Headings | None:
 
 
 def _common(model: TelemetryModel, t: FloatArray) -> tuple[FloatArray, ...]:
-    """Errors of headings at ``t`` ``(U,)`` per standard deviation of what is common to all: ``(U,)`` each [rad]."""
+    """Heading errors at ``t`` ``(U,)`` per standard deviation of each common parameter: ``(U,)`` each [rad]."""
     turned = model.track.yaw(np.stack([t - 0.5 * _RATE_S, t, t + 0.5 * _RATE_S]))
     yaw, rate = turned[1], (turned[2] - turned[0]) / _RATE_S
     late_s = min(model.delay_sigma_s, DELAY_S)

@@ -1,4 +1,4 @@
-"""How far the sources of the scale are apart."""
+"""Consistency of the scale's sources."""
 
 import itertools
 import math

@@ -1,9 +1,9 @@
-"""What telemetry knows about the map: metric scale, gravity, video delay, and where the camera is without vision.
+"""Fusion of map and telemetry: metric scale, gravity, video delay, and pose prediction without vision.
 
-`MotionFusion` takes in frames and messages and asks the rooms: `remembered` (messages, poses, delay, trust),
-`orientation` (map and camera against the drone's world), `metres` (the scale and its sources), `comparison` (is it this
-flight's telemetry?), `telemetry_scale`, `filter_feed` and `prediction`. Nothing is worked out by reading a result: each
-tracked frame may bring a fit, and what it found stands until the next.
+`MotionFusion` receives frames and messages and delegates to its parts: `remembered` (messages, poses, delay, gates),
+`orientation` (map and camera in the drone's world), `scale_estimator` (the scale and its sources), `comparison`
+(validation of telemetry), `telemetry_scale`, `filter_feed` and `prediction`. Reading a result computes nothing: each
+tracked frame may trigger a fit, whose results are valid until the next.
 """
 
 import math
@@ -23,8 +23,8 @@ from edgeslam_torch.fusion.orientation import Orientation
 from edgeslam_torch.fusion.output_frame import OutputFrame
 from edgeslam_torch.fusion.prediction import (
     VISUAL_REACH_S,
-    Carried,
     PoseEstimate,
+    TelemetryPropagation,
     between,
     by_filter,
     by_vision,
@@ -46,18 +46,18 @@ from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySam
 
 _REFIT_S = 1.0
 _FIRST_FIT_S = 0.5
-"""Time from one fit to the next as long as telemetry has told no scale or no delay: a displacement's length."""
+"""Time between fits as long as telemetry has given no scale or no delay: the length of a displacement."""
 _REFIT_SHARE = 0.12
-"""Each fit costs more and changes less than the one before."""
+"""Time between fits as a share of the duration so far: later fits cost more and change less."""
 _USUAL_SIGMA = 0.01
-"""Standard deviation of a visual pose whose own is not known any more [map units, rad]."""
+"""Standard deviation assumed for a visual pose from the log [map units, rad]."""
 
 
 class MotionFusion:
-    """Ties the visual map to the drone's telemetry; `EdgeSlam` calls it for every frame and every packet.
+    """Aligns the visual map with the drone's telemetry; `EdgeSlam` calls it for every frame and every packet.
 
-    The map may be in any gauge: ``T_w_c`` in arbitrary units and axes, as long as they stay the same.
-    A frame stamped ``t`` shows what telemetry reported at ``t - delay``.
+    The map may be in any fixed gauge: ``T_w_c`` in arbitrary units and axes.
+    A frame stamped ``t`` corresponds to telemetry at ``t - delay``.
 
     Args:
         config: Settings.
@@ -69,7 +69,7 @@ class MotionFusion:
         self.config = config
         given = np.asarray(T_b_c, dtype=np.float64)
         self.refined_poses: Callable[[float], tuple[FloatArray, FloatArray]] | None = None
-        """Gives stamps and poses of the frames since a stamp, in the map as it is now; asked before each fit."""
+        """Returns stamps and poses of the frames since a stamp, in the present map; called before each fit."""
         self.flight = Remembered(
             config,
             TelemetryTrack(config.velocity_frame, config.max_gap_s),
@@ -81,11 +81,11 @@ class MotionFusion:
         self.metres = ScaleEstimator(config, focal_sigma)
         self._comparison = Comparison(config)
         self._filter = FilterFeed(config, given)
-        self._unrest = ScaleConvergence()
+        self._convergence = ScaleConvergence()
         self._drift: str | None = None
-        """That parts of the map have different scales, in words."""
+        """Warning that parts of the map have different scales."""
         self._fitted_s = self._followed_s = -math.inf
-        """Stamps at which it was last fitted, and last followed the map between fits."""
+        """Stamps of the last fit, and of the last adaptation to the map between fits."""
         self._counts: Counter[str] = Counter()
 
     # --- input ---------------------------------------------------------------------------------------------------
@@ -94,7 +94,7 @@ class MotionFusion:
         """State messages in the order of arrival."""
         for sample in self.flight.track.add(samples):
             if np.isfinite(sample.rpy_rad).all():
-                self.orientation.heard_attitude(sample.stamp_s)
+                self.orientation.note_attitude(sample.stamp_s)
             self._filter.add_telemetry(sample, self.metres.fit.shortfall_m_s)
 
     def add_visual(
@@ -107,7 +107,7 @@ class MotionFusion:
             T_w_c: Camera to map ``(4, 4)`` [map units].
             sigma_t: Standard deviation of its translation per axis [map units].
             sigma_r_rad: Standard deviation of its rotation per axis.
-            tracked: False when the pose does not rest on this frame's image (predicted, lost): it is then no evidence.
+            tracked: False when the pose does not rest on this frame's image (predicted, lost): it is no measurement.
         """
         if not tracked or not np.isfinite(T_w_c).all():
             self._memory.interrupt()
@@ -119,7 +119,7 @@ class MotionFusion:
             return
         visual = VisualPose(stamp_s, np.array(T_w_c, dtype=np.float64), sigma_t, sigma_r_rad)
         self._memory.add(visual)
-        if self._is_due(stamp_s) or (stamp_s - self._fitted_s >= _FIRST_FIT_S and self.orientation.has_parted()):
+        if self._is_due(stamp_s) or (stamp_s - self._fitted_s >= _FIRST_FIT_S and self.orientation.has_diverged()):
             self._remember_refined(stamp_s, self.config.window_s)
             self._refit()
         elif self.metres.told is not None and stamp_s - max(self._fitted_s, self._followed_s) >= _REFIT_S:
@@ -130,14 +130,14 @@ class MotionFusion:
             self._filter.clear()
 
     def _follow_map(self, stamp_s: float) -> None:
-        """Take the scale along with a map that refinement has enlarged since the last fit."""
+        """Adapt the scale to a map that refinement has scaled since the last fit."""
         self._followed_s = stamp_s
         before = self._memory.displacements()
         self._remember_refined(stamp_s, REACH_S)
         self.metres.follow(math.log(grown(before, self._memory.displacements(), stamp_s)))
 
     def add_earlier(self, stamps_s: FloatArray, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
-        """Frames on which a new piece of map rests, before its first tracked one: they have moved with the drone, too.
+        """Add the frames on which a new submap rests, from before its first tracked one.
 
         Args:
             stamps_s: Their stamps ``(F,)``, increasing.
@@ -151,22 +151,22 @@ class MotionFusion:
                 self._memory.add(VisualPose(stamp_s, T, sigma_t, sigma_r_rad))
 
     def revise(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
-        """Later knowledge of earlier poses: a map that was refined has moved them, and its scale has drifted less.
+        """Replace earlier poses by refined ones.
 
         Args:
-            stamps_s: Stamps of frames ``(F,)``, as given to `add_visual`; others are left alone.
-            T_w_c: Their poses ``(F, 4, 4)`` in the map as it is now.
+            stamps_s: Stamps of frames ``(F,)``, as given to `add_visual`; others are ignored.
+            T_w_c: Their poses ``(F, 4, 4)`` in the present map.
         """
         self._remember(stamps_s, T_w_c)
         self._refit(flying=False)
 
     def _remember_refined(self, stamp_s: float, reach_s: float) -> None:
-        """Poses of the last seconds as the map has them now, and how much that changes."""
+        """Update the poses of the last seconds to the present map, and measure the change."""
         if self.refined_poses is None:
             return
         before = self._memory.sightings()
         self._remember(*self.refined_poses(stamp_s - reach_s))
-        self._unrest.compare(before, self._memory.sightings(), stamp_s)
+        self._convergence.compare(before, self._memory.sightings(), stamp_s)
 
     def _remember(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
         self._memory.revise(stamps_s, T_w_c)
@@ -174,13 +174,13 @@ class MotionFusion:
             self._filter.move_map(seen.revised(dict(zip(stamps_s.tolist(), T_w_c, strict=True))))
 
     def map_moved(self, T: FloatArray) -> None:
-        """The map around the newest frame was moved, ``T_w_c' = T T_w_c`` with ``(4, 4)``; the camera was not."""
+        """Apply a correction of the map around the newest frame, ``T_w_c' = T T_w_c`` with ``(4, 4)``."""
         self._memory.move_newest(T)
         if (seen := self._filter.seen) is not None:
             self._filter.move_map(seen.moved(T))
 
     def begin_piece(self) -> None:
-        """A new piece of map begins at a predicted pose: what moves between the pieces is not the camera."""
+        """Begin a submap at a predicted pose: the step between the submaps is no motion of the camera."""
         self._filter.clear()
         self._memory.interrupt()
 
@@ -188,15 +188,15 @@ class MotionFusion:
 
     @property
     def delay_s(self) -> float:
-        """Video delay behind telemetry [s]: configured, estimated, or the guess while nothing is known."""
+        """Video delay behind telemetry [s]: configured, estimated, or the default while unknown."""
         return self.flight.delay_s
 
     def scale(self) -> ScaleEstimate:
-        """Metres per map unit with sigma and source; held while the motion says nothing new."""
+        """Metres per map unit with sigma and source; unchanged without new measurements."""
         return self.metres.scale()
 
     def scale_around(self, stamp_s: float) -> ScaleEstimate | None:
-        """Metres per map unit within seconds of an earlier frame, in the map as it is now; None where nothing tells."""
+        """Metres per map unit within seconds of an earlier frame, in the present map; None without telemetry."""
         R_w_m = self._compared_in()
         if R_w_m is None:
             return None
@@ -205,7 +205,7 @@ class MotionFusion:
         return scale_around(moved, self._track, stamp_s, self.delay_s, R_w_m, T_b_c, self.config, low)
 
     def scale_along(self, stamps_s: FloatArray, T_w_c: FloatArray) -> ScaleEstimate | None:
-        """Metres per map unit along some frames of the flight, ``(F,)`` and ``(F, 4, 4)``; None where nothing tells."""
+        """Metres per map unit along some frames of the flight, ``(F,)`` and ``(F, 4, 4)``; None without telemetry."""
         R_w_m = self._compared_in()
         if R_w_m is None or len(stamps_s) == 0:
             return None
@@ -217,23 +217,22 @@ class MotionFusion:
         return scale_of(memory.displacements(), self._track, self.delay_s, R_w_m, T_b_c, self.config, low)
 
     def _compared_in(self) -> FloatArray | None:
-        """``R_w_m`` if velocities may tell a scale."""
+        """``R_w_m`` if velocities may determine a scale."""
         return self.orientation.R_w_m if self._trust.velocity and len(self._track) > 0 else None
 
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
-        """As `Orientation.vertical`; None where the map did not begin upright, and where metres are told: whole degrees
-        are worse than what a map with parallax says."""
+        """As `Orientation.vertical`; None if the map did not begin upright, or has a metric scale: attitude in whole
+        degrees is worse than a map with parallax."""
         asked = self.metres.told is None and self.orientation.began_upright
         return self.orientation.vertical(stamp_s) if asked else None
 
     def attitude_and_position(self, stamp_s: float) -> tuple[tuple[FloatArray, float] | None, Reckoned | None]:
-        """What `Orientation.turned` and `reckoned` say of a frame."""
+        """Results of `Orientation.turned` and `reckoned` for a frame."""
         return self.orientation.turned(stamp_s), self.reckoned(stamp_s)
 
     def reckoned(self, stamp_s: float) -> Reckoned | None:
-        """Place of a frame's camera by dead reckoning; None where telemetry tells no metres, its velocities have not
-        proven to be of this flight, or the metres that are told do not rest on them: in the wrong unit they carry the
-        camera ten times too far beside heights that nothing has compared with them yet."""
+        """Position of a frame's camera by dead reckoning; None without validated velocities or without a metric scale
+        that rests on them: heights alone may give a scale that is wrong by several times."""
         told = self.metres.told
         if told is None or "telemetry" not in told.source:
             return None
@@ -248,7 +247,7 @@ class MotionFusion:
         return self._filter.seen is not None
 
     def predict(self, stamp_s: float) -> PoseEstimate | None:
-        """Camera pose at a frame's stamp from what vision saw last and what telemetry has told since.
+        """Camera pose at a frame's stamp from the last visual poses and later telemetry.
 
         Returns:
             The estimate in map units, or ``None`` before the first tracked frame.
@@ -262,23 +261,23 @@ class MotionFusion:
             return with_velocity(told, last, previous, self.scale())
         return self._predict_unfiltered(last, previous, stamp_s)
 
-    def republished(self, published: OutputFrame, centre_map: FloatArray, held: bool) -> OutputFrame:
-        """What is published, upright and, unless its unit is ``held``, in the unit that is known or guessed now;
-        ``centre_map`` ``(3,)`` stays where it is."""
+    def republished(self, published: OutputFrame, centre_map: FloatArray, keep_scale: bool) -> OutputFrame:
+        """The published frame, levelled and, unless ``keep_scale``, with the present scale or guess; the
+        published position of ``centre_map`` ``(3,)`` stays."""
         published = published.turned_upright(self.orientation.upright(), centre_map)
-        if held:
+        if keep_scale:
             return published
         return published.guessed_anew(self.metres.guess, centre_map).revised(self.scale(), centre_map)
 
     def present(
         self, stamp_s: float, state: str, published: OutputFrame, submap_sigma: float = 0.0, drift_sigma: float = 0.0
     ) -> Present:
-        """What is known after a frame: the motion, and the reliability of its metres.
+        """State after a frame: the motion, and the reliability of its scale.
 
         Args:
             stamp_s: Stamp of the frame.
-            state: What carries its pose.
-            published: What is published of the map.
+            state: State of the machine.
+            published: Published frame of the map.
             submap_sigma: As in `Health`.
             drift_sigma: As in `Health`.
         """
@@ -287,7 +286,7 @@ class MotionFusion:
         return Present(self.snapshot(), published, health.metric, health)
 
     def health(self, stamp_s: float, state: str, metric: bool) -> Health:
-        """Reliability of the metres; arguments as in `present`, and whether the published unit is a metre."""
+        """Reliability of the scale; arguments as in `present`, and whether the published unit is a metre."""
         sources, delay, scale = self.metres.sources(), self.flight.delay.delay, self.scale()
         doubt = self.metres.contradiction()
         return Health(
@@ -306,27 +305,27 @@ class MotionFusion:
         )
 
     def snapshot(self) -> Snapshot | None:
-        """What is known of the present motion, for other threads; ``None`` before the first tracked frame."""
+        """Present motion, for other threads; ``None`` before the first tracked frame."""
         last = self._memory.last
         if last is None:
             return None
         return Snapshot(last, self._memory.previous, self._filter.frozen(), self.scale(), self.flight.delay_sigma_s)
 
     def _predict_unfiltered(self, last: VisualPose, previous: VisualPose | None, stamp_s: float) -> PoseEstimate:
-        """While the filter knows no scale or no delay, telemetry has a hole, or does not go with the images."""
+        """Prediction while the filter has no scale or delay, telemetry has a gap, or contradicts the images."""
         gap = stamp_s - last.stamp_s
         visual = by_vision(last, previous, stamp_s)
         share = 1.0 if previous is None else float(np.clip((gap - VISUAL_REACH_S) / VISUAL_REACH_S, 0.0, 1.0))
         if share == 0.0 or gap <= 0.0 or not self._trust.motion:
             return visual
-        told = self._carried().on(last, stamp_s)
+        told = self._propagation().on(last, stamp_s)
         return visual if told is None else between(visual, told, share)
 
-    def _carried(self) -> Carried:
+    def _propagation(self) -> TelemetryPropagation:
         sigma = self.config.sigma_velocity_m_s
         T_b_c, R_w_m = self.orientation.T_b_c, self.orientation.R_w_m
         delay_s, doubt_s = self.delay_s, self.flight.delay_sigma_s
-        return Carried(self._track, delay_s, doubt_s, T_b_c, R_w_m, self.scale(), self.metres.fit, sigma)
+        return TelemetryPropagation(self._track, delay_s, doubt_s, T_b_c, R_w_m, self.scale(), self.metres.fit, sigma)
 
     def statistics(self) -> dict[str, float]:
         """Counters and the state of the estimates, for the report."""
@@ -342,28 +341,28 @@ class MotionFusion:
         return numbers | self.metres.statistics()
 
     def warnings(self) -> list[str]:
-        """What the depth network or telemetry tells that the images do not bear out, in sentences; it is not used."""
+        """Warnings of depth network or telemetry that the images contradict, and which are not used."""
         drift = [] if self._drift is None else [self._drift]
         return self._trust.warnings() + self._track.warnings() + self.metres.warnings() + drift
 
     def telemetry(self) -> TelemetryModel | None:
-        """Telemetry and its tie to the map as they are now, for refinement; None while there is none.
+        """Present telemetry and its alignment with the map, for refinement; None while there is none.
 
-        Until its metres are known gravity alone speaks, if the map was begun upright: the mean of attitudes that
-        `Orientation.R_w_m` is has the map's own tilt in it by then, and would hold that.
+        Until the metric scale is known only gravity is used, if the map began upright: `Orientation.R_w_m` is a mean
+        over attitudes and would include the map's own tilt.
         """
         model = self._model()
         return None if model is None else replace(model, track=self._track.copy())
 
     def _model(self) -> TelemetryModel | None:
-        """The same on the track that grows, for use at once."""
+        """The same without a copy of the track, for immediate use."""
         told, orientation = self.metres.told, self.orientation
         R_w_m = orientation.R_w_m if told is not None else np.eye(3) if orientation.began_upright else None
         if R_w_m is None:
             return None
         there = self._track.heights()
         heights = [reading for reading in HEIGHTS if reading in there and self._trust.height(reading)]
-        odds = self._trust.at_odds  # what is not used for the scale must not pull at the map either
+        odds = self._trust.at_odds  # sources that are not used for the scale must not constrain the map either
         return TelemetryModel(
             self._track,
             self.config,
@@ -373,7 +372,7 @@ class MotionFusion:
             self.flight.delay_sigma_s,
             1.0 if told is None else math.exp(told.log_scale),
             math.inf if told is None else told.sigma,
-            self.metres.velocity_speaks(self._trust),
+            self.metres.velocity_constrains_map(self._trust),
             heights[0] if told is not None and heights and (odds is None or odds.kept == "height") else None,
             self.metres.fit.truncates,
             self._trust.attitude,
@@ -401,7 +400,7 @@ class MotionFusion:
         return len(self._track) > 0 and (self.orientation.found is None or stamp_s - self._fitted_s >= pause_s)
 
     def _refit(self, flying: bool = True) -> None:
-        """Delay, alignment, trust and scale from what is remembered."""
+        """Fit delay, alignment, gates and scale."""
         last, orientation, metres = self._memory.last, self.orientation, self.metres
         if last is None or len(self._track) == 0:
             return
@@ -417,22 +416,24 @@ class MotionFusion:
         present = FlightSoFar(self._memory, self._track, turned.R_b_c, metres.rough(), network, wander_log)
         self._comparison.judge(self._trust, present, self.flight.delay.delay, turned.R_w_m, flying)
         self._trust.at_odds = None
-        unrest = self._unrest.sigma if flying else 0.0
-        held = metres.held()
+        convergence_sigma = self._convergence.sigma if flying else 0.0
+        previous_scale = metres.previous_scale()
 
         def scale(trust: SensorGate) -> TelemetryScale:
             T_b_c = orientation.T_b_c
-            return TelemetryScale(self.config, T_b_c, present, trust, self.delay_s, turned, held, flying)
+            return TelemetryScale(self.config, T_b_c, present, trust, self.delay_s, turned, previous_scale, flying)
 
-        metres.take(scale(self._trust).opinion(), unrest, self._trust)
+        metres.take(scale(self._trust).opinion(), convergence_sigma, self._trust)
         guesses = flying and metres.told is None
-        metres.provisional_scale(scale(self._trust.supposing_heights()).opinion() if guesses else None, unrest)
+        metres.provisional_scale(
+            scale(self._trust.supposing_heights()).opinion() if guesses else None, convergence_sigma
+        )
         oldest = self._memory.sightings().stamps_s[0]
         self._drift = drift_in_words(self.scale_around, float(oldest), last.stamp_s)
 
     def _search_delay(self) -> None:
         guessed = not math.isfinite(self.flight.delay_sigma_s)
         self.flight.delay.search(self._memory, self._track)
-        if guessed and math.isfinite(self.flight.delay_sigma_s):  # heights were compared at a wrong delay
+        if guessed and math.isfinite(self.flight.delay_sigma_s):  # heights were compared with a wrong delay
             for reading in HEIGHTS:
                 self._trust.forget(reading)

@@ -1,4 +1,4 @@
-"""How the map and the camera are turned against the drone and its world, by the drone's attitude."""
+"""Orientation of the map, and of the camera on the drone, from the drone's attitude."""
 
 import math
 
@@ -14,31 +14,31 @@ from edgeslam_torch.geometry.rotations import mean_rotation, rotation_vector, tu
 from edgeslam_torch.types import FloatArray
 
 _TURNED_S = 5.0
-"""Time over which the map and the drone's attitude have turned together: maps drift by a degree in it."""
+"""Time over which map and attitude are aligned; maps drift by a degree in it."""
 _AT_ONCE_S = 0.5
-"""Time from the first frame in which the first attitude comes if it comes at all: five messages."""
+"""Time after the first frame in which the first attitude must arrive to level the map: five messages."""
 _STAMPED_S = 0.05
-"""Standard deviation of a message's moment: half of the time from one to the next."""
+"""Standard deviation of a message's stamp: half the message interval."""
 _LEAST_FACING = 30
-"""Frames that tell how a map is turned: one or two seconds."""
+"""Minimum number of frames for the heading of a submap: one or two seconds."""
 
 
 class Orientation:
     """Rotations of one flight's map.
 
     Args:
-        flight: What is remembered.
-        given: Camera in the body as it was given ``(4, 4)`` [m].
+        flight: Messages and poses so far.
+        given: Configured pose of the camera in the body ``(4, 4)`` [m].
     """
 
     def __init__(self, flight: Remembered, given: FloatArray) -> None:
         self._flight, self.given = flight, given
         self.found: Turned | None = None
-        """By the newest fit; None without telemetry attitude."""
+        """Result of the newest fit; None without telemetry attitude."""
         self.began_s = math.nan
         """Stamp of the first frame."""
         self.began_upright = False
-        """Whether the map's z axis is up: its first camera was turned so by the drone's attitude."""
+        """Whether the map's z axis is up: its first pose was set by the drone's attitude."""
         self._attitude_s = math.inf
 
     @property
@@ -48,7 +48,7 @@ class Orientation:
 
     @property
     def T_b_c(self) -> FloatArray:
-        """Camera in the body ``(4, 4)`` [m] as the flight's turns have it: what `R_w_m` was found with."""
+        """Camera in the body ``(4, 4)`` [m] as estimated, consistent with `R_w_m`."""
         if self.found is None:
             return self.given
         T_b_c = self.given.copy()
@@ -57,15 +57,15 @@ class Orientation:
 
     @property
     def mount_turned_rad(self) -> float:
-        """How far the camera is turned from how it was given."""
+        """Angle between the estimated and the configured mount."""
         return float(np.linalg.norm(rotation_vector(self.T_b_c[:3, :3] @ self.given[:3, :3].T)))
 
-    def heard_attitude(self, stamp_s: float) -> None:
-        """A message with an attitude has come."""
+    def note_attitude(self, stamp_s: float) -> None:
+        """Record a message with attitude."""
         self._attitude_s = min(self._attitude_s, stamp_s)
 
     def fitted(self) -> Turned | None:
-        """By all that is remembered; the camera's mount only once attitude has turned as the images did."""
+        """Fit to all stored poses; the mount is estimated only after the attitude was validated by images."""
         flight = self._flight
         told = attitudes(flight.memory.sightings(), flight.track, flight.delay_s)
         if told is None:
@@ -75,8 +75,8 @@ class Orientation:
             return mount_by_turns(told.R_m_c, told.R_w_b, told.stamp_s, R_b_c, sigma_rad)
         return Turned(R_b_c, told.map_to_world(R_b_c), np.full(3, sigma_rad))
 
-    def has_parted(self) -> bool:
-        """Whether attitude that had proven to be of this flight has just turned otherwise than the images."""
+    def has_diverged(self) -> bool:
+        """Whether a validated attitude has begun to disagree with the images."""
         flight, found = self._flight, self.found
         asked = found is not None and flight.trust.turns and math.isfinite(flight.delay_sigma_s)
         told = attitudes(flight.memory.newest(LATELY), flight.track, flight.delay_s) if asked else None
@@ -85,8 +85,8 @@ class Orientation:
         return float(np.linalg.norm(rotation_vector(told.map_to_world(found.R_b_c) @ found.R_w_m.T))) > MOST_APART_RAD
 
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
-        """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and how far [rad] that leaned within
-        the doubt about the video's delay; None where attitude is not to be asked. Of a map that `began_upright`."""
+        """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and its maximum error [rad] due to the
+        uncertain delay; None without usable attitude. For a map that `began_upright`."""
         flight = self._flight
         at_s = np.array([stamp_s - flight.delay_s])
         if not (flight.trust.attitude and flight.track.covered(at_s, at_s)[0]):
@@ -97,9 +97,9 @@ class Orientation:
         return self.given[:3, :3].T @ flight.track.attitude(at_s)[0, 2], float(leaned[0])
 
     def turned(self, stamp_s: float) -> tuple[FloatArray, float] | None:
-        """Rotation ``R_c_m`` ``(3, 3)`` of a frame's camera by the drone's attitude, turned into the map as the last
-        seconds' frames were, and how far [rad] it turned within the doubt about the video's delay; None where
-        telemetry has not proven to be of this flight, or the map is too young."""
+        """Rotation ``R_c_m`` ``(3, 3)`` of a frame's camera by the drone's attitude, aligned with the map over the last
+        seconds, and its maximum error [rad] due to the uncertain delay; None without validated telemetry or enough
+        frames."""
         flight = self._flight
         late_s = math.hypot(flight.delay_sigma_s, _STAMPED_S)
         around = stamp_s - flight.delay_s + np.array([0.0, -late_s, late_s])
@@ -117,9 +117,8 @@ class Orientation:
         return R_m_c[0].T, doubt
 
     def facing_along(self, stamps_s: FloatArray, T_w_c: FloatArray) -> tuple[FloatArray, float] | None:
-        """``R_w_m`` ``(3, 3)`` of some frames, ``(F,)`` and ``(F, 4, 4)``, and the standard deviation of its turn about
-        the vertical [rad]: how they differ, and a mount that is not known better. None where telemetry has not proven
-        to be of this flight, or covers too few."""
+        """``R_w_m`` ``(3, 3)`` of some frames, ``(F,)`` and ``(F, 4, 4)``, and the standard deviation of its heading
+        [rad]: scatter, and the error of the mount. None without validated telemetry for enough of them."""
         flight = self._flight
         if not (flight.trust.turns and math.isfinite(flight.delay_sigma_s)):
             return None
@@ -133,19 +132,18 @@ class Orientation:
         return R_w_m, math.hypot(flight.config.alignment_sigma_rad, float(np.sqrt(np.mean(angle**2))))
 
     def upright(self) -> FloatArray | None:
-        """``R_w_m`` where attitude may turn the world: when it has proven to be of this flight, or as the one may that
-        comes with the first picture."""
+        """``R_w_m`` if attitude may level the world: when it was validated, or arrived with the first frame."""
         if self.found is None or not self._flight.trust.attitude:
             return None
         at_once = self._attitude_s - self.began_s < _AT_ONCE_S
         return self.found.R_w_m if at_once or self._flight.trust.turns else None
 
     def leaning(self) -> str | None:
-        """That no attitude was sure enough to tell where up is, in words; None where the drone told none."""
+        """Warning that no usable attitude levelled the world; None if the drone sent none."""
         if not math.isfinite(self._attitude_s):
             return None
         return (
-            "where up is was not known, the world leans as the first camera did: no attitude of the drone that came at "
-            "once or has proven to be of this flight covers a picture with a pose (the first one came "
-            f"{self._attitude_s - self.began_s:.1f} s after the first picture)"
+            "the direction of gravity is unknown, the world leans as the first camera did: no attitude of the drone "
+            "that arrived at once or was validated covers a frame with a pose (the first one came "
+            f"{self._attitude_s - self.began_s:.1f} s after the first frame)"
         )

@@ -1,8 +1,8 @@
 """Transform from map units and axes to the published world: metric and z up, each if known.
 
-The map itself is never rescaled; its units are published as they are, until sensors of the drone that are sure
-contradict them: a revision, about the camera, so that the live pose does not jump. One more turns a map upright that
-began before the drone's attitude was known. Final results without telemetry are levelled by `mapping/level/`.
+The map itself is never rescaled. Its units are published as they are until reliable sensors contradict them; the
+revision then rescales about the camera, so that the live pose does not jump. A map that began before the attitude was
+known is levelled once. Final results without telemetry are levelled by `mapping/level/`.
 """
 
 import math
@@ -15,23 +15,22 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray, PointCloud, ScaleEstimate
 
 T_LEVEL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""``T_w_c`` of a level camera that looks along world x: the first pose when nothing tells the attitude."""
+"""``T_w_c`` of a level camera that looks along world x: the first pose without attitude."""
 
 SURE = 0.1
-"""Maximum relative sigma of a scale that may revise the published one: better than any depth network in a new
-place."""
+"""Maximum relative sigma of a scale that may revise the published one: below that of depth networks in a new place."""
 
 CONTRADICTION = 2.0
 """Deviation of the published scale that triggers a revision [sigmas]."""
 
 GUESS_SURE = 0.15
 _GUESS_CONTRADICTION, _GUESS_OFF = 1.0, 0.05
-"""The same while the unit is still the one that the map began with, and the least deviation of its logarithm: depth
-networks have stated 0.16 at best. A guess is given up as soon as measured metres are likely to be nearer to the truth,
-unless a revision would hardly tell."""
+"""The same while the scale is still the initial guess, with the minimum deviation of its logarithm. Depth networks
+reach 0.16 at best: a guess is replaced as soon as measured metres are probably better, unless the change is
+negligible."""
 
 MEASURED = frozenset({"telemetry", "height"})
-"""Sources that measure metres; a depth network has guessed them at the start already."""
+"""Sources that measure metres; the depth network has set the initial guess already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +41,11 @@ class OutputFrame:
     R: FloatArray = field(default_factory=lambda: np.eye(3))
     offset: FloatArray = field(default_factory=lambda: np.zeros(3))
     revision: int = 0
-    """How often the scale was revised so far."""
+    """Number of revisions so far."""
     guessed: bool = True
-    """Whether its unit is still a guess: nothing proven has told metres."""
+    """Whether the scale is still the initial guess, without validated metres."""
     upright: bool = False
-    """Whether its axes stay what they are: z is up by the drone's attitude, or they are those of an earlier flight."""
+    """Whether the axes are final: z up by the drone's attitude, or those of an earlier flight."""
 
     def pose(self, T_w_c: FloatArray) -> FloatArray:
         """Poses ``(..., 4, 4)`` of the map as published."""
@@ -69,7 +68,7 @@ class OutputFrame:
         return math.isfinite(estimate.sigma) and not self.contradicts(estimate)
 
     def contradicts(self, estimate: ScaleEstimate) -> bool:
-        """Whether an estimate [metres per map unit] leaves no room for the published scale."""
+        """Whether an estimate [metres per map unit] contradicts the published scale."""
         sigma = estimate.sigma / estimate.value
         return bool(self._off(estimate) > CONTRADICTION * sigma)
 
@@ -78,22 +77,22 @@ class OutputFrame:
         return abs(math.log(estimate.value / self.scale))
 
     def _worse_guess(self, estimate: ScaleEstimate) -> bool:
-        """Whether the published scale is the first guess, and surely worse than an estimate."""
+        """Whether the published scale is the initial guess, and significantly worse than an estimate."""
         off = self._off(estimate)
         return self.guessed and off > max(_GUESS_OFF, _GUESS_CONTRADICTION * estimate.sigma / estimate.value)
 
     def guessed_anew(self, guess: ScaleEstimate | None, centre_map: FloatArray) -> "OutputFrame":
-        """The same with a better guess of its unit; arguments as for `revised`."""
+        """The same with a better guess of its scale; arguments as for `revised`."""
         if guess is None or not self._worse_guess(guess):
             return self
         return self._rescaled(guess.value, centre_map)
 
     def turned_upright(self, R_w_m: FloatArray | None, centre_map: FloatArray) -> "OutputFrame":
-        """The same with z up, by the smallest turn, if it is not yet and an attitude tells where up is.
+        """The same with z up, by the smallest rotation, if it is not yet level and the attitude is known.
 
         Args:
-            R_w_m: Rotation ``(3, 3)`` from the map to a world whose z is up; None as long as nothing tells it.
-            centre_map: Point of the map ``(3,)`` that stays where it is published.
+            R_w_m: Rotation ``(3, 3)`` from the map to a world whose z is up; None while unknown.
+            centre_map: Point of the map ``(3,)`` whose published position stays.
         """
         if self.upright or R_w_m is None:
             return self
@@ -101,7 +100,7 @@ class OutputFrame:
         return replace(turned, revision=self.revision + 1, upright=True)
 
     def levelled(self, up_map: FloatArray, centre_map: FloatArray) -> "OutputFrame":
-        """The same with a direction ``(3,)`` of the map up, by the smallest turn; ``centre_map`` as above."""
+        """The same with a direction ``(3,)`` of the map up, by the smallest rotation; ``centre_map`` as above."""
         turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [self.R @ up_map])
         R = turn.as_matrix() @ self.R
         return replace(self, R=R, offset=self.offset + self.scale * ((self.R - R) @ centre_map))
@@ -111,18 +110,18 @@ class OutputFrame:
         return replace(self, scale=scale, offset=offset, revision=self.revision + 1)
 
     def revised(self, estimate: ScaleEstimate, centre_map: FloatArray) -> "OutputFrame":
-        """The same at an estimated scale, if that is measured, sure and contradicts the published one.
+        """The same at an estimated scale, if that is measured, accurate and contradicts the published one.
 
         Args:
             estimate: Metres per map unit.
-            centre_map: Point of the map ``(3,)`` that stays where it is published.
+            centre_map: Point of the map ``(3,)`` whose published position stays.
         """
         if not self.is_wrong_by(estimate):
             return self
         return replace(self._rescaled(estimate.value, centre_map), guessed=False)
 
     def is_wrong_by(self, estimate: ScaleEstimate) -> bool:
-        """Whether an estimate [metres per map unit] is measured, sure, and contradicts the published scale."""
+        """Whether an estimate [metres per map unit] is measured, accurate, and contradicts the published scale."""
         measured = not MEASURED.isdisjoint(estimate.source.split("+"))
         sure = GUESS_SURE if self.guessed else SURE
         wrong = self.contradicts(estimate) or self._worse_guess(estimate)
@@ -130,7 +129,7 @@ class OutputFrame:
 
 
 def first_pose(rpy_rad: FloatArray, T_b_c: FloatArray) -> FloatArray:
-    """``T_w_c`` at the origin from the drone's attitude ``(3,)``; level and forward when it is not known."""
+    """``T_w_c`` at the origin from the drone's attitude ``(3,)``; level and forward if unknown."""
     if not np.isfinite(rpy_rad).all():
         return T_LEVEL.copy()
     T = np.eye(4)

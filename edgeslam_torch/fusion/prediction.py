@@ -1,8 +1,8 @@
-"""Prediction of the camera at a stamp without an image: by visual velocity, by the Kalman filter, by telemetry alone.
+"""Prediction of the camera pose without an image: by visual velocity, by the Kalman filter, by telemetry alone.
 
-Two frames a twentieth of a second apart tell the velocity better than state messages of whole dm/s and degrees; after a
-fifth of a second it is the other way round. So the filter's prediction and that of constant velocity are averaged by
-what each may be wrong: the one's covariance, the other's unknown acceleration.
+Consecutive frames give a better velocity than telemetry in whole dm/s and degrees, for up to a fifth of a second. The
+filter's prediction and that of constant velocity are therefore averaged by their variances: the filter's covariance,
+and the unknown acceleration.
 """
 
 import math
@@ -20,15 +20,14 @@ from edgeslam_torch.geometry.rotations import rotation_vector
 from edgeslam_torch.types import FloatArray, ScaleEstimate
 
 VISUAL_REACH_S = 0.15
-"""The last visual velocity predicts better than 10 Hz readings of 0.1 m/s up to about here."""
+"""Time up to which the last visual velocity predicts better than 10 Hz readings of 0.1 m/s."""
 _VISUAL_LIMIT_S = 0.5
-"""Without telemetry, the camera is held where constant velocity puts it after this time."""
+"""Time after which constant velocity stops, without telemetry."""
 _ACCELERATION_M_S2 = 1.0
 _ANGULAR_ACCELERATION_RAD_S2 = 1.0
-"""Standard deviations of what a hand or a small drone does most of the time: on simulated flights, fr1_xyz and
-redkitchen constant velocity is 20 mm and 20 mrad off after 0.2 s."""
+"""Standard deviations for a hand or a small drone: constant velocity is off by 20 mm and 20 mrad after 0.2 s."""
 _PACKET_S = 0.15
-"""Telemetry runs ahead of a late video; one packet of extrapolation is allowed."""
+"""Maximum extrapolation of telemetry, which is ahead of a late video: one packet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,13 +95,13 @@ def by_vision(last: VisualPose, previous: VisualPose | None, stamp_s: float) -> 
 
 
 @dataclass(frozen=True, slots=True)
-class Carried:
+class TelemetryPropagation:
     """Inputs for propagating a pose by telemetry."""
 
     track: TelemetryTrack
     delay_s: float
     delay_sigma_s: float
-    """Infinite while the delay is a guess."""
+    """Infinite while the delay is unknown."""
     T_b_c: FloatArray
     """Camera in the body ``(4, 4)`` [m]."""
     R_w_m: FloatArray | None
@@ -112,7 +111,7 @@ class Carried:
     sigma_velocity_m_s: float
 
     def on(self, last: VisualPose, stamp_s: float) -> PoseEstimate | None:
-        """Pose at a stamp; turned alone while the scale is unknown, ``None`` where telemetry has a hole."""
+        """Pose at a stamp; rotation only while the scale is unknown, ``None`` in a gap of telemetry."""
         if len(self.track) < 2:
             return None
         times = np.array([last.stamp_s, stamp_s]) - self.delay_s
@@ -139,7 +138,7 @@ class Carried:
         return PoseEstimate(stamp_s, T, sigma_t, sigma_r_rad, "telemetry")
 
     def _late_rad(self, times: FloatArray) -> float:
-        """By how much a turn between two moments is another one if the video is later or earlier than believed."""
+        """Maximum error of a rotation between two moments due to the uncertain delay."""
         late_s = min(self.delay_sigma_s, DELAY_S)
         R_w_b = [self.track.attitude(times + by_s) for by_s in (0.0, -late_s, late_s)]
         turned = [R[0].T @ R[1] for R in R_w_b]
@@ -147,7 +146,7 @@ class Carried:
 
 
 def between(visual: PoseEstimate, telemetry: PoseEstimate, share: float) -> PoseEstimate:
-    """From the one (share 0) to the other (share 1)."""
+    """Interpolation from the one (share 0) to the other (share 1)."""
     if share >= 1.0:
         return telemetry
     T = se3.exp(share * se3.log(telemetry.T_w_c @ se3.inverse(visual.T_w_c))) @ visual.T_w_c

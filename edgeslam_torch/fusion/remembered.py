@@ -1,4 +1,4 @@
-"""What is remembered of a flight for tying its map to its telemetry; each room of `MotionFusion` reads it."""
+"""Data of a flight for aligning its map with telemetry, shared by the parts of `MotionFusion`."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from edgeslam_torch.fusion.telemetry.visual_memory import VisualMemory
 
 @dataclass(frozen=True, slots=True)
 class Remembered:
-    """Messages and poses, the delay between them, and which readings may be used."""
+    """Messages and poses, the delay between them, and which readings are usable."""
 
     config: FusionConfig
     track: TelemetryTrack
@@ -21,10 +21,10 @@ class Remembered:
 
     @property
     def delay_s(self) -> float:
-        """Video delay behind telemetry [s]: configured, estimated, or the guess while nothing is known."""
+        """Video delay behind telemetry [s]: configured, estimated, or the default while unknown."""
         return self.delay.delay.value_s
 
     @property
     def delay_sigma_s(self) -> float:
-        """Standard deviation of `delay_s`; infinite while it is a guess, 0 when configured."""
+        """Standard deviation of `delay_s`; infinite while unknown, 0 when configured."""
         return self.delay.delay.sigma_s

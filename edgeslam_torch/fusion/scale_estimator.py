@@ -1,4 +1,4 @@
-"""Metres per map unit: what telemetry, the depth network and an earlier flight say, and what is made of it."""
+"""Metres per map unit from telemetry, the depth network and an earlier flight."""
 
 import math
 from collections.abc import Sequence
@@ -13,16 +13,16 @@ from edgeslam_torch.fusion.telemetry_scale import TelemetryFit
 from edgeslam_torch.types import ScaleEstimate
 
 _BELIEVED = 0.3
-"""Relative sigma of a scale from telemetry that is used."""
+"""Maximum relative sigma of a scale from telemetry."""
 _SURE = 0.15
-"""Relative sigma of a scale by heights alone by which velocities pull at the map: half of what is believed, so that two
-sigmas are a third and not more than a half. A scale that is wrong by several times tears the map by them."""
+"""Maximum relative sigma of a scale from heights alone with which velocities constrain the map: with a scale that is
+wrong by several times they would distort it."""
 _FOCAL_SHARE = 0.4
-"""How much of a focal length's error the scale from telemetry takes on: with 0.7 to 1.5 times the right one the root
-mean square over fr1_xyz, redkitchen and euroc_mh05_a is 0.4 in the logarithm."""
+"""Share of a focal length's relative error that the scale from telemetry inherits; set on recordings with focal lengths
+of 0.7 to 1.5 times the true one."""
 
 Found = tuple[LogScale, TelemetryFit]
-"""A scale by telemetry, and how it was found."""
+"""A scale by telemetry, and the details of its fit."""
 
 
 class ScaleEstimator:
@@ -38,119 +38,118 @@ class ScaleEstimator:
         self._depth = DepthRatios(self._depth_bias_log)
         truncates = config.velocity_rounding == "truncate"
         self.fit = TelemetryFit(shortfall_m_s=0.5 * config.velocity_step_m_s if truncates else 0.0)
-        """How `told` was found."""
+        """Details of the fit of `told`."""
         self.told: LogScale | None = None
-        """Scale by the drone's own sensors; held while they say nothing new."""
+        """Scale by the drone's own sensors; unchanged without new measurements."""
         self.guess: ScaleEstimate | None = None
-        """Scale by a climb before anything has proven that telemetry is of this flight; None after that. No claim of
-        metres: a better guess of the published unit than the depth network's."""
+        """Scale by a climb before telemetry is validated; None afterwards. Not metric: only a better guess of the
+        published scale than the depth network's."""
         self._remembered: LogScale | None = None
         self._scale = ScaleEstimate()
         self._rests_on: tuple[LogScale | None, LogScale | None, DepthScale | None] = (None, None, None)
 
-    # --- what is said --------------------------------------------------------------------------------------------
+    # --- input ---------------------------------------------------------------------------------------------------
 
     def add_depth_ratio(self, ratio: DepthRatio) -> None:
-        """How one keyframe's network depth compares with the map's."""
+        """Add the ratio of the network's depth to the map's in one keyframe."""
         self._depth.add(ratio)
 
     def replace_depth_ratios(self, ratios: Sequence[DepthRatio]) -> None:
-        """The same of all keyframes, once the map has another unit."""
+        """Replace the ratios of all keyframes after a change of the map's scale."""
         self._depth = DepthRatios(self._depth_bias_log)
         for ratio in ratios:
             self._depth.add(ratio)
 
     def remember(self, scale: ScaleEstimate | None) -> None:
-        """Metres per unit of the map that the camera is in, as an earlier flight left them; None for a map of its own.
+        """Metres per unit of the camera's submap from an earlier flight; None for a new submap.
 
-        They take the place of the depth network's opinion: its error in a place is the same in every flight.
+        They replace the depth network's estimate, whose error in a place is the same in every flight.
         """
         if scale is None or not math.isfinite(scale.sigma):
             self._remembered = None
         else:
             self._remembered = LogScale(math.log(scale.value), scale.sigma / scale.value, "atlas")
 
-    def take(self, found: Found | None, unrest: float, trust: SensorGate) -> None:
-        """What telemetry says now.
+    def take(self, found: Found | None, convergence_sigma: float, trust: SensorGate) -> None:
+        """Update with telemetry.
 
         Args:
             found: Its scale.
-            unrest: Relative error of that because the map still moves.
-            trust: Which readings may be used: what rests on others is forgotten.
+            convergence_sigma: Relative error due to later changes of the map.
+            trust: Usable readings; a scale that rests on others is dropped.
         """
         if found is not None:
             self.fit = found[1]
         if found is not None and found[0].sigma < _BELIEVED:
-            self.told = replace(found[0], sigma=math.hypot(found[0].sigma, unrest))
+            self.told = replace(found[0], sigma=math.hypot(found[0].sigma, convergence_sigma))
         elif not self._still_trusted(trust) or self._of_heights():
             self.told, self.fit = None, TelemetryFit(shortfall_m_s=self.fit.shortfall_m_s)
-        # else nothing new to say: hover, pure rotation, or telemetry missing
+        # else no new information: hover, pure rotation, or no telemetry
 
-    def provisional_scale(self, found: Found | None, unrest: float) -> None:
-        """What heights would say if they were of this flight; as in `take`."""
+    def provisional_scale(self, found: Found | None, convergence_sigma: float) -> None:
+        """Update the guess with heights that are not validated yet; arguments as in `take`."""
         self.guess = None
-        if found is not None and (sigma := math.hypot(found[0].sigma, unrest)) < _BELIEVED:
+        if found is not None and (sigma := math.hypot(found[0].sigma, convergence_sigma)) < _BELIEVED:
             value = math.exp(found[0].log_scale)
             self.guess = ScaleEstimate(value, value * sigma, found[0].source)
 
     def follow(self, log_ratio: float) -> None:
-        """Take the scale along with a map that has grown by ``exp(log_ratio)``."""
+        """Adapt the scale to a map that has grown by ``exp(log_ratio)``."""
         if self.told is not None:
             self.told = replace(self.told, log_scale=self.told.log_scale - log_ratio)
 
     def _of_heights(self) -> bool:
-        """Whether heights alone had told the scale: of a map that has turned away from what they had seen they tell
-        nothing any more."""
+        """Whether the scale rests on heights alone, which are void once the map's vertical has changed."""
         return self.told is not None and self.told.source == "height"
 
     def _still_trusted(self, trust: SensorGate) -> bool:
-        """Whether all that the held opinion rests on may still tell the scale."""
+        """Whether all sources of the present scale are still usable."""
         trusted = {"telemetry": trust.velocity and trust.tells_scale, "height": any(map(trust.height, HEIGHTS))}
         settled = trust.at_odds is None or trust.at_odds.kept is not None
         return settled and all(trusted[source] for source in self.fit.sources)
 
-    # --- what is made of it --------------------------------------------------------------------------------------
+    # --- output --------------------------------------------------------------------------------------------------
 
     def scale(self) -> ScaleEstimate:
-        """Metres per map unit with sigma and source; held while the motion says nothing new."""
+        """Metres per map unit with sigma and source; unchanged without new measurements."""
         rests_on = self._remembered, self.told, self._depth.scale()
-        if rests_on != self._rests_on:  # it is asked for several times a frame
+        if rests_on != self._rests_on:  # cached, since it is used several times a frame
             self._rests_on, self._scale = rests_on, fuse(self._settled().used)
         return self._scale
 
-    def held(self) -> float | None:
-        """By telemetry alone."""
+    def previous_scale(self) -> float | None:
+        """Scale by telemetry alone."""
         return None if self.told is None else math.exp(self.told.log_scale)
 
     def network_unit(self) -> float | None:
-        """By the depth network, right or wrong; None before anything has been compared."""
+        """Scale by the depth network alone; None before the first comparison."""
         depth = self._depth.scale()
         return None if depth is None else math.exp(depth.log_scale)
 
     def network_wander_log(self) -> float:
-        """By how much the depth network's ratio to the map changes from keyframe to keyframe."""
+        """Variation of the depth network's ratio to the map between keyframes, in the logarithm."""
         depth = self._depth.scale()
         return 0.0 if depth is None else depth.wander_log
 
     def rough(self) -> float | None:
-        """For what counts as motion."""
+        """Rough scale, for thresholds on motion."""
         unit = self.network_unit()
-        return self.held() if unit is None else unit
+        return self.previous_scale() if unit is None else unit
 
     def network(self) -> LogScale | None:
-        """The depth network's opinion with the focal length's doubt."""
+        """The depth network's estimate including the uncertainty of the focal length."""
         depth = self._depth.scale()
         return None if depth is None else self._with_focal(depth)
 
-    def velocity_speaks(self, trust: SensorGate) -> bool:
-        """Whether velocities may pull at the map: not by metres that heights alone told, and hardly know."""
+    def velocity_constrains_map(self, trust: SensorGate) -> bool:
+        """Whether velocities may constrain the map: not with an inaccurate scale from heights alone."""
         told = self.told
         if told is None or not ("telemetry" in told.source or told.sigma < _SURE):
             return False
         return self.velocity_is_right(trust)
 
     def velocity_is_right(self, trust: SensorGate) -> bool:
-        """Whether velocities are this flight's, and nothing that is used instead contradicts them."""
+        """Whether velocities are validated and consistent with the sources in use."""
         return trust.velocity and (trust.at_odds is None or trust.at_odds.kept == "telemetry")
 
     def sources(self) -> tuple[ScaleEstimate, ...]:
@@ -160,11 +159,11 @@ class ScaleEstimator:
         return tuple(told)
 
     def contradiction(self) -> str | None:
-        """That sources contradict each other, in words."""
+        """Warning of contradicting sources."""
         return self._settled().warning
 
     def warnings(self) -> list[str]:
-        """The same, and what is wrong with the depth network here, where its metres are needed."""
+        """The same, and a warning of the depth network where its metres are needed."""
         depth = self._depth.scale() if self.told is None else None
         own = (None if depth is None else depth.warning(), self.contradiction())
         return [said for said in own if said is not None]
@@ -178,16 +177,16 @@ class ScaleEstimator:
         return numbers if depth is None else numbers | depth.statistics()
 
     def _settled(self) -> Settled:
-        """Opinions that may be averaged."""
+        """Estimates that may be averaged."""
         told, depth = self.told, self._depth.scale()
         if told is not None:
             told = replace(told, sigma=math.hypot(told.sigma, _FOCAL_SHARE * self._focal_sigma))
-        if self._remembered is not None:  # which the network has had its part in
+        if self._remembered is not None:  # which includes the network's estimate
             return settled_with_network(told, self._remembered, True)
         return settled_with_network(told, self.network(), depth is not None and depth.in_domain)
 
     def _with_focal(self, depth: DepthScale) -> LogScale:
-        """Map depth, and the network's metres, go with the focal length: its whole uncertainty is the ratio's too."""
+        """Map depth and network depth scale with the focal length: the ratio has its whole uncertainty."""
         return replace(depth.opinion, sigma=math.hypot(depth.sigma, self._focal_sigma))
 
 

@@ -1,4 +1,4 @@
-"""The camera at the present moment, from records that never change: another thread may ask while frames are stepped."""
+"""The camera at the present moment, from immutable records that other threads may use."""
 
 import math
 from collections.abc import Sequence
@@ -13,17 +13,17 @@ from edgeslam_torch.fusion.telemetry.visual_memory import VisualPose
 from edgeslam_torch.types import FloatArray, Health, PoseNow, ScaleEstimate, TelemetrySample
 
 _LONGEST_STEP_S = 0.5
-"""Tracked frames further apart tell no velocity."""
+"""Maximum time between tracked frames for a velocity."""
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """What fusion knows of the present motion."""
+    """State of the fusion at one moment."""
 
     last: VisualPose
     """Newest tracked frame."""
     previous: VisualPose | None
-    """The one before, if tracking has not been interrupted since."""
+    """The one before, if tracking was not interrupted since."""
     filter: FrozenFilter | None
     scale: ScaleEstimate
     delay_sigma_s: float
@@ -31,7 +31,7 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Present:
-    """State after a frame: the snapshot, the published world, and their reliability."""
+    """State after a frame: the snapshot, the published world, and its reliability."""
 
     snapshot: Snapshot | None = None
     published: OutputFrame = field(default_factory=OutputFrame)
@@ -43,7 +43,7 @@ class Present:
         """The camera at a moment; ``None`` before the first tracked frame.
 
         Args:
-            stamp_s: When; no earlier than the newest state message.
+            stamp_s: No earlier than the newest state message.
             telemetry: State messages that arrived since the snapshot.
         """
         known = self.snapshot
@@ -70,7 +70,7 @@ class Present:
         )
 
     def _by_vision(self, known: Snapshot, stamp_s: float) -> PoseNow:
-        """Constant velocity; where there are no two frames the sigma of the velocity is infinite."""
+        """Constant velocity; without two frames the sigma of the velocity is infinite."""
         last, previous = known.last, known.previous
         seen = by_vision(last, previous, stamp_s)
         velocity, sigma_v = np.zeros(3), math.inf
@@ -93,7 +93,7 @@ class Present:
 
 
 def _with_doubts(view: FilterView, known: Snapshot) -> FloatArray:
-    """The filter's covariance, and what it does not know: delay and scale may be wrong."""
+    """The filter's covariance, with the uncertainty of delay and scale added."""
     covariance = view.covariance.copy()
     way = view.T_seen_c[:3, 3] * (known.scale.sigma / known.scale.value)
     late = view.velocity_m_s * known.delay_sigma_s

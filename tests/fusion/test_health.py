@@ -24,17 +24,17 @@ def test_disagreement_counts_sigmas_of_the_difference():
     assert disagreement([one]) == disagreement([]) == 0.0
 
 
-def test_words_name_what_is_wrong_and_nothing_else():
+def test_the_status_line_names_problems_only():
     good = Health(9.0, "tracking", True, SURE, telemetry_age_s=0.1, battery=0.63)
     assert str(good) == "metres to 3 %, battery 63 %"
-    assert replace(good, metric=False).in_words() == "no metres, battery 63 %"
+    assert str(replace(good, metric=False)) == "no metres, battery 63 %"
     bad = replace(good, telemetry_age_s=4.2, disagreement=7.0, battery=math.nan)
-    assert str(bad) == "metres to 3 %, sources 7 sigmas apart, telemetry silent for 4.2 s"
+    assert str(bad) == "metres to 3 %, sources differ by 7 sigmas, no telemetry for 4.2 s"
     apart = replace(good, submap_sigma=0.3, drift_sigma=0.4)
-    assert str(apart) == "metres to 3 %, 0.5 m unsure of where the flight began, battery 63 %"
-    lone = replace(good, submap_sigma=math.inf).in_words()
-    assert lone == "metres to 3 %, nothing relates this piece of map to where the flight began, battery 63 %"
-    assert Health(9.0, "tracking", True, SURE).in_words() == "metres to 3 %", "no drone, no word of it"
+    assert str(apart) == "metres to 3 %, position sigma 0.5 m from the start, battery 63 %"
+    lone = str(replace(good, submap_sigma=math.inf))
+    assert lone == "metres to 3 %, submap unrelated to where the flight began, battery 63 %"
+    assert str(Health(9.0, "tracking", True, SURE)) == "metres to 3 %", "no drone, no word of it"
 
 
 def test_health_of_a_flight_and_of_its_silence(rng, swinging, replay):

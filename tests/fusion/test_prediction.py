@@ -7,7 +7,7 @@ import pytest
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.fusion.prediction import Carried
+from edgeslam_torch.fusion.prediction import TelemetryPropagation
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.fusion.telemetry.visual_memory import VisualPose
 from edgeslam_torch.fusion.telemetry_scale import TelemetryFit
@@ -32,7 +32,7 @@ def test_exact_telemetry_carries_the_camera_to_where_it_is(rng, swinging, gap_s)
         T = motion.T_w_c.copy()
         T[:, :3, 3] *= 0.5
         last = VisualPose(motion.stamps_s[i] + 2 * DELAY_S, T[i], 1e-3, 1e-3)
-        carried = Carried(
+        carried = TelemetryPropagation(
             track, DELAY_S, 0.0, T_B_C, np.eye(3), ScaleEstimate(2.0, 0.02, "known"), TelemetryFit(), 0.05
         )
         found = carried.on(last, motion.stamps_s[now] + 2 * DELAY_S)
@@ -64,7 +64,7 @@ def test_a_turn_is_as_sure_as_the_delay_is_known(rng, swinging):
         now, T = i + 16, motion.T_w_c
         last = VisualPose(motion.stamps_s[i] + 2 * DELAY_S, T[i], 1e-3, 1e-3)
         known = ScaleEstimate(1.0, 0.02, "known")
-        carried = Carried(track, DELAY_S - wrong_s, np.inf, T_B_C, np.eye(3), known, TelemetryFit(), 0.05)
+        carried = TelemetryPropagation(track, DELAY_S - wrong_s, np.inf, T_B_C, np.eye(3), known, TelemetryFit(), 0.05)
         found = carried.on(last, motion.stamps_s[now] + 2 * DELAY_S)
         off.append(np.linalg.norm(se3.log(se3.inverse(T[now]) @ found.T_w_c)[3:]))
         sigma.append(found.sigma_r_rad)

@@ -26,10 +26,10 @@ def path(until_s, scale=1.0, way=1.0):
 
 def rescaled(by, within_s=0.5):
     """After two comparisons, the second of which finds a map larger by a factor."""
-    unrest = ScaleConvergence()
-    unrest.compare(path(2.0), path(2.0), 2.0)
-    unrest.compare(path(2.0 + within_s), path(2.0 + within_s, by), 2.0 + within_s)
-    return unrest
+    convergence_sigma = ScaleConvergence()
+    convergence_sigma.compare(path(2.0), path(2.0), 2.0)
+    convergence_sigma.compare(path(2.0 + within_s), path(2.0 + within_s, by), 2.0 + within_s)
+    return convergence_sigma
 
 
 @pytest.mark.parametrize("by", [1.1, 1 / 1.1])
@@ -38,34 +38,34 @@ def test_a_map_that_was_rescaled_will_be_rescaled_again(by):
 
 
 def test_unrest_is_forgotten_within_seconds():
-    unrest = rescaled(1.1)
-    before = unrest.sigma
-    unrest.compare(path(3.5), path(3.5), 3.5)
-    assert unrest.sigma == pytest.approx(before * math.exp(-1.0))
+    convergence_sigma = rescaled(1.1)
+    before = convergence_sigma.sigma
+    convergence_sigma.compare(path(3.5), path(3.5), 3.5)
+    assert convergence_sigma.sigma == pytest.approx(before * math.exp(-1.0))
 
 
 def test_changes_that_go_on_add_up():
-    unrest = rescaled(1.1)
-    unrest.compare(path(3.0), path(3.0, 1.1), 3.0)
-    assert unrest.sigma == pytest.approx(AS_MUCH_AGAIN * math.log(1.1) * (1.0 + math.exp(-0.5)))
+    convergence_sigma = rescaled(1.1)
+    convergence_sigma.compare(path(3.0), path(3.0, 1.1), 3.0)
+    assert convergence_sigma.sigma == pytest.approx(AS_MUCH_AGAIN * math.log(1.1) * (1.0 + math.exp(-0.5)))
 
 
 def test_what_is_tracked_since_says_nothing_of_the_map():
     """Only the frames after the last comparison change; and a first comparison has nothing to compare."""
-    unrest = ScaleConvergence()
-    unrest.compare(path(2.0), path(2.0, 1.3), 2.0)
-    assert unrest.sigma == 0.0
+    convergence_sigma = ScaleConvergence()
+    convergence_sigma.compare(path(2.0), path(2.0, 1.3), 2.0)
+    assert convergence_sigma.sigma == 0.0
     after = path(2.5)
     after.T[after.stamps_s > 2.0, 0, 3] += 1.0
-    unrest.compare(path(2.5), after, 2.5)
-    assert unrest.sigma == 0.0
+    convergence_sigma.compare(path(2.5), after, 2.5)
+    assert convergence_sigma.sigma == 0.0
 
 
 def test_a_hover_has_no_size():
-    unrest = ScaleConvergence()
-    unrest.compare(path(2.0, way=0.01), path(2.0, way=0.01), 2.0)
-    unrest.compare(path(2.5, way=0.01), path(2.5, way=0.02), 2.5)
-    assert unrest.sigma == 0.0
+    convergence_sigma = ScaleConvergence()
+    convergence_sigma.compare(path(2.0, way=0.01), path(2.0, way=0.01), 2.0)
+    convergence_sigma.compare(path(2.5, way=0.01), path(2.5, way=0.02), 2.5)
+    assert convergence_sigma.sigma == 0.0
 
 
 def test_a_scale_told_by_a_map_at_unrest_is_less_sure(rng, swinging, replay):
