@@ -333,7 +333,7 @@ class EdgeSlam:
         self._calibration_warning = calibration_warning(self.camera, self._shown_keyframes(), self.map.anchors.p_w)
 
     def feel(self, force: SpecificForce) -> None:
-        """Readings of an accelerometer over the whole recording; they tell where up is, nothing else."""
+        """Accelerometer readings over the whole recording; they only determine the vertical."""
         self._force = force
 
     def _find_up(self) -> None:
@@ -378,27 +378,27 @@ class EdgeSlam:
         """Triangulated anchors ``(N, 3)`` and edge points ``(M, 3)`` float64 of keyframes that see what the newest
         frame sees, as published.
 
-        What an obstacle is told by, without what is known of the next room: a consistent snapshot in a millisecond;
-        both whole maps take thirty to fifty.
+        For obstacle detection, without the map of other rooms: a consistent snapshot in a millisecond; both whole maps
+        take thirty to fifty.
         """
         if not self.log.records:
             return np.zeros((0, 3)), np.zeros((0, 3))
         with self.map.lock:
             reference = self.map.keyframes[self.map.resolve(self.log.records[-1].keyframe_id)[0]]
             seen = self.map.anchors_seen_by([reference, *self.map.covisible(reference, _AROUND)])
-            seen = seen[~self.map.anchors.from_depth[seen]]  # a network's guesses tell nothing of another network
+            seen = seen[~self.map.anchors.from_depth[seen]]  # predicted depths do not validate another network
             p_w, edges_w = self.map.anchors.p_w[seen], self.edges.around(reference)
         return self._system.published.points(p_w), self._system.published.points(edges_w)
 
     def fresh_edges(self, image: np.ndarray, nearest: float, farthest: float) -> tuple[FloatArray, FloatArray]:
-        """Edges of the newest frame whose depth keyframes around it tell, before any other frame has confirmed them.
+        """Edges of the newest frame with depths from covisible keyframes, before other frames have confirmed them.
 
-        What is near is told a few milliseconds after its picture; `edge_map` has it two seconds later, and surely.
+        Available a few milliseconds after the frame; `edge_map` has them two seconds later, confirmed.
 
         Args:
-            image: The newest frame's, undistorted.
-            nearest: Least depth that is searched, in published units.
-            farthest: Greatest depth.
+            image: The newest frame, undistorted.
+            nearest: Minimum depth, in published units.
+            farthest: Maximum depth.
 
         Returns:
             Undistorted pixels ``(N, 2)`` and z-depths ``(N,)`` in published units; none before the first frame.
@@ -426,7 +426,7 @@ class EdgeSlam:
         return [k for id, k in sorted(self.map.keyframes.items()) if self.map.piece_of(id) == shown]
 
     def _shown_piece(self) -> int | None:
-        """Number of the piece whose map is given out: the camera's while flying, in the end the largest."""
+        """Number of the published submap: the camera's during the run, the largest one at the end."""
         if not self.log.records:
             return None
         return self.support().largest() if self._finished else self.map.piece_of(self.log.records[-1].keyframe_id)
@@ -454,7 +454,7 @@ class EdgeSlam:
         return list(self._joining.atlas.joins)
 
     def closures(self) -> list[Closure]:
-        """Loops that were closed inside a piece, with the evidence, in the order of time."""
+        """Loops closed inside a submap, with their statistics, in the order of time."""
         return list(self._joining.atlas.closures)
 
     def earlier_flights(self) -> dict[str, Any] | None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 DISAGREEMENT = 3.0
-"""Sigmas between two sources of the scale that a status line mentions; right ones are that far apart in 0.3 %."""
+"""Difference between two sources of the scale [sigmas] that a status line mentions; exceeded in 0.3 % by chance."""
 SILENCE_S = 1.0
 """Age of the newest state message that a status line mentions: ten of a Tello's messages."""
 
@@ -29,7 +29,7 @@ _SHOWN = 4
 
 
 class Record:
-    """Base of records that hold arrays: shown by their shapes, since a page of numbers tells nobody anything."""
+    """Base of records with arrays, whose representation shows shapes only."""
 
     __slots__ = ()
 
@@ -322,12 +322,12 @@ class Support(Record):
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What pilots and programs need to know before they rely on a pose or its metres."""
+    """Reliability of a pose and of its metric scale."""
 
     stamp_s: float
     """Stamp of the frame."""
     state: str
-    """What carries the pose, see `edgeslam_torch.states.machine.State`: ``starting``, ``tracking``, ``edges only``,
+    """State of the machine, see `edgeslam_torch.states.machine.State`: ``starting``, ``tracking``, ``edges only``,
     ``lost``."""
     metric: bool
     """As in `SlamOutput`."""

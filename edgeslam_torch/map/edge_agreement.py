@@ -1,4 +1,4 @@
-"""Edges that several keyframes show: which are the same, and how far the keyframes disagree about their depth."""
+"""Consistency of edge depths between keyframes that observe the same edges."""
 
 import math
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ from edgeslam_torch.types import FloatArray, IntArray
 AGREE_PX = 2.0
 """Maximum distance of a projected edge point from the same edge in another keyframe."""
 USUAL_BEND = 0.015
-"""Relative, where too few keyframes overlap to tell: what is found in simulated rooms and in recordings."""
+"""Typical relative bend of the map, used if too few keyframes overlap; empirical."""
 SHARED = 1.7
-"""Error of the depth over what overlapping keyframes disagree by, since neighbours share part of their error. With this
-factor a twentieth of the points of simulated places lies beyond two sigmas, as it should."""
+"""Ratio of the depth error to the disagreement of overlapping keyframes, which share part of their error. With this
+factor 5 % of the points of simulated places are beyond two sigmas, as of a normal distribution."""
 _GAP = 3
-"""Keyframes between two that are compared: nearer ones are refined in the same windows and agree."""
+"""Minimum number of keyframes between two that are compared; nearer ones are refined in the same windows."""
 _PAIRS, _LEAST_PAIRS = 200, 10
 _POINTS, _LEAST_POINTS = 400, 40
-"""Edges that are looked for in the other keyframe, and how many must be found."""
+"""Number of edges searched in the other keyframe, and minimum number found."""
 _MOST_TURNED = math.cos(math.radians(40.0))
-"""Views that differ by more see other sides of things."""
+"""Cosine of the maximum angle between views that show the same sides of objects."""
 
 _REACH = math.ceil(AGREE_PX + 0.5)
 """Radius [px] of a painted edge: a query may be rounded by half a pixel."""
@@ -40,14 +40,14 @@ class View:
 
 
 def bend(views: list[View], camera: Camera) -> float:
-    """Relative standard deviation of depth that the edges' own sigmas do not have: by how much the map is bent.
+    """Relative standard deviation of depth that the edges' own sigmas do not have: the bend of the map.
 
-    Keyframes that see the same edges but are not neighbours disagree about their depth by the drift between them. The
-    median over pairs of keyframes of what they disagree by as a whole tells it; mismatched edges do not count there.
+    Depths of common edges in distant keyframes differ by the drift between these. The estimate is the median over pairs
+    of keyframes of their median difference, which is robust to mismatched edges.
     """
     found = []
     painted, drawn = None, -1
-    for a, b in sorted(_pairs(views)):  # so that one painted view is kept at a time: it has as many pixels as the image
+    for a, b in sorted(_pairs(views)):  # one painted view at a time, which has as many pixels as the image
         if painted is None or drawn != a:
             painted, drawn = PaintedEdges.of(views[a].uv, (camera.width, camera.height)), a
         off = _disagreement(views[a], painted, views[b], camera)
@@ -60,7 +60,7 @@ def bend(views: list[View], camera: Camera) -> float:
 
 
 def _pairs(views: list[View]) -> list[tuple[int, int]]:
-    """At most `_PAIRS` ordered pairs of views that look the same way and are no neighbours, drawn at random."""
+    """At most `_PAIRS` random ordered pairs of distant keyframes with similar viewing directions."""
     ahead = np.array([v.T_w_c[:3, 2] for v in views]).reshape(-1, 3)
     a, b = np.nonzero(ahead @ ahead.T > _MOST_TURNED)
     known = np.array([len(v.uv) >= _LEAST_POINTS for v in views], dtype=bool)

@@ -1,4 +1,4 @@
-"""What anchors and keyframes remember in map units, taken along where a refinement changes the scale of their place.
+"""Rescaling of distances stored with anchors and keyframes after a refinement changed the local scale.
 
 A window changes the scale by too little to matter. Telemetry that takes back a drift changes it by half and more:
 anchors would be looked for on the wrong pyramid level, and priors would pull back.
@@ -12,14 +12,14 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.types import FloatArray, IntArray
 
 MIN_ANCHORS = 8
-"""Anchors of a keyframe whose depths tell how its place has grown."""
+"""Minimum number of anchors of a keyframe for its change of scale."""
 
 Depths = dict[int, tuple[IntArray, FloatArray]]
 """Anchors that each keyframe sees, by its id, and their depths in it."""
 
 
 def depths(slam_map: SlamMap, keyframes: list[Keyframe]) -> Depths:
-    """Depths of the anchors that keyframes see, as they are now."""
+    """Present depths of the anchors in keyframes."""
     seen = {}
     for keyframe in keyframes:
         held = keyframe.anchor[keyframe.anchor >= 0]
@@ -28,11 +28,11 @@ def depths(slam_map: SlamMap, keyframes: list[Keyframe]) -> Depths:
 
 
 def take_along(slam_map: SlamMap, keyframes: list[Keyframe], before: Depths) -> None:
-    """Scale what anchors and keyframes remember by how much farther each keyframe's anchors are than ``before``.
+    """Scale stored distances by the change of each keyframe's anchor depths since ``before``.
 
     Args:
         slam_map: After the refinement.
-        keyframes: That took part, in the order of time: an anchor grows as the last one that sees it.
+        keyframes: Refined ones, in the order of time: an anchor is scaled by its last observer.
         before: Their `depths` before it.
     """
     anchors = slam_map.anchors

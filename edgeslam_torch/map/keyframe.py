@@ -19,7 +19,7 @@ the depth network, which its covariance takes for independent."""
 
 @dataclass(frozen=True, slots=True)
 class TrackedMotion:
-    """Where tracking saw a keyframe from another one."""
+    """Tracked motion from a reference keyframe to another one."""
 
     reference_id: int
     T_c_r: FloatArray
@@ -28,7 +28,7 @@ class TrackedMotion:
     """``(6, 6)`` inverse covariance of its left tangent."""
 
     def scaled(self, scale: float) -> "TrackedMotion":
-        """The same once the map has grown by a factor."""
+        """The same after a change of the map's scale."""
         by = np.array([1.0 / scale] * 3 + [1.0] * 3)
         return replace(self, T_c_r=se3.scaled(self.T_c_r, scale), information=self.information * np.outer(by, by))
 
@@ -57,7 +57,7 @@ class Keyframe:
     network_m: FloatArray | None = None
     """``(N,)`` network depth at the keypoints [m], NaN where it is undefined; kept when ``depth`` is released."""
     tracked: TrackedMotion | None = None
-    """Set when it was made while most depths that it sees rested on priors."""
+    """Set if most of its depths rested on priors at creation."""
     image: NDArray[np.uint8] | None = None
     """Undistorted, ``(H, W, 3)`` BGR or ``(H, W)`` grey; for edges."""
     grey: NDArray[np.uint8] | None = None
@@ -74,7 +74,7 @@ class Keyframe:
         return -self.T_c_w[:3, :3].T @ self.T_c_w[:3, 3]
 
     def scale(self, scale: float) -> None:
-        """Take along what it remembers in map units once the map has grown by a factor; the pose is the caller's."""
+        """Rescale stored distances after a change of the map's scale, except for the pose."""
         self.tracked = None if self.tracked is None else self.tracked.scaled(scale)
 
     def keypoints_with_anchor(self) -> IntArray:
@@ -98,7 +98,7 @@ def make_keyframe(id: int, frame_index: int, stamp_s: float, T_c_w: FloatArray, 
 
 
 def tracked_motion(reference: Keyframe, T_c_w: FloatArray, covariance: FloatArray) -> TrackedMotion | None:
-    """Where tracking saw a camera from a keyframe; None without a covariance ``(6, 6)`` that can be inverted."""
+    """Tracked motion from a keyframe to a camera; None without an invertible covariance ``(6, 6)``."""
     if not np.isfinite(covariance).all() or np.linalg.matrix_rank(covariance, hermitian=True) < 6:
         return None
     return TrackedMotion(reference.id, T_c_w @ reference.T_w_c, np.linalg.inv(SHARED_ERRORS**2 * covariance))

@@ -1,4 +1,4 @@
-"""Which keyframe saw which anchor, for the writers."""
+"""Observations of anchors by keyframes, for the writers."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from edgeslam_torch.types import Observations
 
 
 def observations(keyframes: list[Keyframe], slam_map: SlamMap) -> Observations:
-    """What ``keyframes`` saw of the anchors that `Anchors.cloud` gives for them; the caller holds the map's lock."""
+    """Observations by ``keyframes`` of the anchors of `Anchors.cloud`; the caller holds the map's lock."""
     shown = slam_map.anchors.confirmed(slam_map.anchors_seen_by(keyframes))
     row = np.full(len(slam_map.anchors.alive), -1)
     row[shown] = np.arange(len(shown))

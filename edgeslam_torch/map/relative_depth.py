@@ -8,11 +8,11 @@ from edgeslam_torch.geometry.robust_statistics import robust_sigma, tukey_weight
 from edgeslam_torch.types import FloatArray
 
 MIN_ANCHORS = 12
-"""Two are fitted exactly: the rest says how well the line fits."""
+"""Minimum number of anchors; two define the line, the others its residuals."""
 TRIALS = 200
 """Pairs of anchors tried: with half of the anchors wrong, all are bad with a probability of 1e-25."""
 MAX_SIGMA_LOG = 0.5
-"""Spread of the anchors around the line above which it says nothing: a third of them are off by 1.6 and more."""
+"""Maximum spread of the anchors around the line; a third of them then deviate by a factor of 1.6."""
 MIN_SIGMA_LOG = 0.02
 STEPS = 5
 
@@ -38,7 +38,7 @@ class InverseFit:
         return np.log(self.depth(relative) / relative)
 
     def sigma(self, relative: FloatArray) -> FloatArray:
-        """Log standard deviation of that depth ``(N,)``: the spread, and the line's own doubt there."""
+        """Log standard deviation of that depth ``(N,)``: the spread, and the uncertainty of the line."""
         rows = np.stack([1.0 / relative, np.ones_like(relative)], axis=-1)
         line = np.sqrt(np.einsum("...i,ij,...j->...", rows, self.covariance, rows)) * self.depth(relative)
         return np.hypot(self.sigma_log, line)

@@ -1,4 +1,4 @@
-"""Whether the camera is back on ground that an earlier part of the map shows."""
+"""Detection of revisits: the camera is back at a place of an earlier part of the map."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,17 +10,17 @@ from edgeslam_torch.types import FloatArray
 MIN_SHARED = 15
 """Anchors in common from which on two keyframes are covisible, as in `SlamMap.covisible`."""
 OUT_OF_VIEW = 5
-"""Anchors in common below which a keyframe does not show what another one does: along a straight way these fade, and
-are now more, now less than `MIN_SHARED`."""
+"""Common anchors below which two keyframes show different places; along a straight path their number decreases and
+fluctuates around `MIN_SHARED`."""
 
 
 def is_back(earlier: list[Keyframe], recent: list[Keyframe], reach: FloatArray) -> bool:
-    """Whether a recent keyframe sees what earlier ones had seen and what was out of view while the camera was away.
+    """Whether a recent keyframe shares anchors with an earlier one that was out of view in between.
 
     Args:
         earlier: In the order of time.
         recent: Those that followed, in the order of time.
-        reach: How far from each of both ``(K,)`` [map units] a camera has only turned.
+        reach: Distance from each of both ``(K,)`` [map units] within which the camera only rotated.
     """
     members = [*earlier, *recent]
     shared = _shared(members, len(earlier))
@@ -38,7 +38,7 @@ def is_back(earlier: list[Keyframe], recent: list[Keyframe], reach: FloatArray) 
 
 
 def _shared(members: list[Keyframe], earlier: int) -> NDArray[np.int32]:
-    """How many anchors each of some keyframes has in common with each of the first ones of them, ``(K, E)``."""
+    """Number of common anchors of keyframes with each of the first ones of them, ``(K, E)``."""
     held = [k.anchor[k.anchor >= 0] for k in members]
     row = np.repeat(np.arange(len(members)), [len(h) for h in held])
     sees = csr_array((np.ones(len(row), np.int32), (row, np.concatenate(held))))

@@ -29,11 +29,11 @@ class SlamMap:
         self.revision = 0
         """Incremented with every change of observations, to invalidate caches."""
         self.begun: dict[int, str] = {}
-        """Origin of the first pose and scale of each piece, by its number."""
+        """Origin of the first pose and scale of each submap, by its number."""
         self._piece: dict[int, int] = {}
-        """Piece in which each keyframe, alive or removed, was created."""
+        """Submap in which each keyframe, alive or removed, was created."""
         self._joined: dict[int, int] = {}
-        """Piece -> older piece that it was joined to."""
+        """Submap -> older submap that it was merged with."""
         self._next_id = 0
 
     def next_keyframe_id(self) -> int:
@@ -47,7 +47,7 @@ class SlamMap:
         return T_keyframe_heir @ self.keyframes[heir].T_c_w
 
     def median_depth(self, keyframe: Keyframe) -> float | None:
-        """Of the anchors that a keyframe observes [map units]; None without any in front of it."""
+        """Median depth of a keyframe's anchors [map units]; None without any in front of it."""
         held = keyframe.anchor[keyframe.anchor >= 0]
         z = se3.transform(keyframe.T_c_w, self.anchors.p_w[held])[:, 2]
         return float(np.median(z[z > 0])) if (z > 0).any() else None
@@ -68,35 +68,35 @@ class SlamMap:
     # -- pieces ------------------------------------------------------------------------------------------------
 
     def begin_piece(self, begun: str) -> None:
-        """Keyframes added from now on belong to a new piece, unless the last one holds no anchor.
+        """Begin a submap for later keyframes, unless the last one has no anchor.
 
         Args:
-            begun: Origin of the new piece's first pose and scale, in words.
+            begun: Origin of the submap's first pose and scale.
         """
         members = (k for k in self.keyframes.values() if self._piece[k.id] == self.piece)
         if not self.begun or any((k.anchor != NO_ANCHOR).any() for k in members):
             self.add_piece(begun)
 
     def add_piece(self, begun: str) -> int:
-        """Number of a new piece, whatever the last one holds."""
+        """Number of a new submap, unconditionally."""
         self.begun[len(self.begun)] = begun
         return len(self.begun) - 1
 
     @property
     def piece(self) -> int:
-        """Number of the piece that new keyframes belong to."""
+        """Number of the submap of new keyframes."""
         return max(len(self.begun) - 1, 0)
 
     def piece_of(self, keyframe_id: int) -> int:
-        """Number of the piece that a keyframe, alive or removed, currently belongs to."""
+        """Number of the present submap of a keyframe, alive or removed."""
         piece = self._piece[keyframe_id]
         while piece in self._joined:
             piece = self._joined[piece]
         return piece
 
     def join_pieces(self, keyframe: Keyframe, others: list[Keyframe]) -> bool:
-        """Record that a keyframe and others share anchors, hence belong to one piece; returns whether pieces were
-        joined."""
+        """Record that a keyframe and others share anchors, hence belong to one submap; returns whether submaps were
+        merged."""
         mine = self.piece_of(keyframe.id)
         found = {self.piece_of(other.id) for other in others} - {mine}
         oldest = min(found | {mine})
@@ -105,7 +105,7 @@ class SlamMap:
         return bool(found)
 
     def scale_links(self, scale_of: dict[int, float]) -> None:
-        """Follow keyframes around which the map was scaled, by their ids: the ways from removed ones to them."""
+        """Rescale the links of removed keyframes to remaining ones whose surroundings were scaled, by their ids."""
         for removed in list(self.links):
             heir, T = self.resolve(removed)
             if heir in scale_of:
@@ -201,7 +201,7 @@ class SlamMap:
 
         Args:
             keyframe: The new one.
-            reference: Keyframe that it was tracked against, whose piece it belongs to; the newest piece without one.
+            reference: Keyframe that it was tracked against, which gives the submap; the newest submap without one.
         """
         self.revision += 1
         self.keyframes[keyframe.id] = keyframe
@@ -209,7 +209,7 @@ class SlamMap:
         self.anchors.observations[keyframe.anchor[keyframe.anchor >= 0]] += 1
 
     def restore_keyframe(self, keyframe: Keyframe, piece: int) -> None:
-        """Add a keyframe of an earlier flight, under its own id, to a piece that was added for it."""
+        """Add a keyframe of an earlier flight, under its own id, to a submap added for it."""
         self.revision += 1
         self.keyframes[keyframe.id] = keyframe
         self._piece[keyframe.id] = piece
@@ -226,7 +226,7 @@ class SlamMap:
         """Remove a keyframe; its frames are linked to the nearest surviving one in time."""
         self.forget_observations(keyframe, keyframe.keypoints_with_anchor())
         others = (id for id in self.keyframes if id != keyframe.id)
-        # Prefer its own piece: another piece may move independently.
+        # Prefer its own submap: another one may move independently.
         mine = self.piece_of(keyframe.id)
         heir = min(others, key=lambda id: (self.piece_of(id) != mine, abs(id - keyframe.id), id))
         self.links[keyframe.id] = (heir, keyframe.T_c_w @ se3.inverse(self.keyframes[heir].T_c_w))
@@ -257,7 +257,7 @@ class SlamMap:
         total = np.stack([np.bincount(held, ray[:, i], len(wanted)) for i in range(3)], axis=1)[ids]
         norm = np.linalg.norm(total, axis=1)
         self.anchors.normal[ids] = total / np.where(norm > 0, norm, 1.0)[:, None]
-        # Of several observations of one anchor the last assignment is kept: the newest keyframe's.
+        # Of several observations of one anchor the last assignment remains: the newest keyframe's.
         octave = np.concatenate([k.features.octave for k in keyframes])[seen]
         self.anchors.max_distance[held] = distance * self.scale_factor**octave
         self.anchors.words[held] = np.concatenate([k.words for k in keyframes])[seen]

@@ -1,4 +1,4 @@
-"""Keypoints of a keyframe moved to where the image shows what their anchors looked like first.
+"""Sub-pixel alignment of a keyframe's keypoints with the first views of their anchors.
 
 ORB finds corners on whole pixels of its pyramid, a third of a pixel off at the finest level and one at the coarsest.
 What an anchor's patch looked like in the earliest keyframe that sees it is found again to a twentieth of a pixel
@@ -19,12 +19,12 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.types import FloatArray, IntArray
 
 VIEWS = 30
-"""Earlier keyframes that are asked for an anchor's first view, the most covisible ones."""
+"""Number of earlier keyframes searched for first views, the most covisible ones."""
 SIGMA_PX = 0.4
 """Standard deviation of an aligned keypoint beside white noise: surfaces that are not parallel to the image, lenses and
 shutters; the noise alone leaves a twentieth of a pixel."""
 _UNSURE_PX = 0.5
-"""Standard deviation by what is left of a patch from which on a corner says more."""
+"""Maximum standard deviation by the residual of a patch; beyond it the detected corner is more accurate."""
 _FARTHEST_PX = 1.5
 """How far corners move, in pixels of their octave: quantisation and noise, three sigmas."""
 _LEVELS = 3
@@ -33,7 +33,7 @@ _LEVELS = 3
 
 @dataclass(frozen=True, slots=True)
 class _Looks:
-    """What one view shows of some anchors, as a keyframe would see it."""
+    """Patches of anchors in one view, warped to a keyframe."""
 
     view: Keyframe
     theirs: IntArray
@@ -49,10 +49,10 @@ class _Looks:
 def align(slam_map: SlamMap, keyframe: Keyframe, camera: Camera) -> int:
     """Align a keyframe's keypoints that have anchors with the anchors' earliest views; called under the map's lock.
 
-    The earliest view stays as it is: any point of a patch is as good as another one.
+    The earliest view defines the reference point of a patch.
 
     Args:
-        slam_map: The map; depths and poses say how patches look from elsewhere.
+        slam_map: The map; depths and poses define the warp of patches.
         keyframe: ``features.uv`` and ``aligned_px`` are changed.
         camera: Of all keyframes.
 
@@ -77,7 +77,7 @@ def align(slam_map: SlamMap, keyframe: Keyframe, camera: Camera) -> int:
 
 
 def _first_looks(slam_map: SlamMap, keyframe: Keyframe, camera: Camera) -> list[_Looks]:
-    """What the earliest views of a keyframe's anchors show of them."""
+    """Patches of a keyframe's anchors in their earliest views."""
     known = [k for k in slam_map.covisible(keyframe, VIEWS) if k.id < keyframe.id and k.grey is not None]
     known.sort(key=lambda k: k.id)
     mine, first, theirs = _first_seen(keyframe, known, len(slam_map.anchors.alive))

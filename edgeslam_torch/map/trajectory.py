@@ -27,8 +27,7 @@ class FrameRecord:
     supported: bool
     """Whether the pose rests on a map that the images support."""
     T_c_before: FloatArray | None = None
-    """``(4, 4)`` of a frame that became a keyframe: its pose as tracked, relative to the keyframe of the frame before;
-    refinement has moved it since."""
+    """``(4, 4)`` pose of a new keyframe as tracked, before refinement, relative to the previous frame's keyframe."""
 
 
 class TrajectoryLog:
@@ -87,7 +86,7 @@ class TrajectoryLog:
             record.supported = True
 
     def scale(self, scale_of: dict[int, float]) -> None:
-        """Follow keyframes around which the map was scaled, by their ids: the ways from them to their frames."""
+        """Rescale relative poses of frames to keyframes whose surroundings were scaled, by their ids."""
         before = None
         for record in self.records:
             grown = scale_of.get(self.map.resolve(record.keyframe_id)[0], 1.0)
@@ -97,14 +96,14 @@ class TrajectoryLog:
             before = grown
 
     def support(self) -> Support:
-        """What each frame's pose rests on in the map as it is now."""
+        """Support of each frame's pose in the present map."""
         with self.map.lock:
             piece_of = {id: self.map.piece_of(id) for id in {r.keyframe_id for r in self.records}}
         piece = np.array([piece_of[r.keyframe_id] for r in self.records], dtype=np.int64)
         return Support(piece, np.array([r.supported for r in self.records], dtype=bool))
 
     def pieces(self) -> list[Piece]:
-        """The pieces that the frames belong to in the map as it is now, in the order of their numbers."""
+        """Submaps of the frames in the present map, in the order of their numbers."""
         support = self.support()
         stamps = np.array([r.stamp_s for r in self.records])
         pieces = []
@@ -132,17 +131,16 @@ class TrajectoryLog:
 def _close_gaps(
     records: list[FrameRecord], T_c_w: FloatArray, T_k_w: dict[int, FloatArray], own: NDArray[np.bool_]
 ) -> None:
-    """Spread over the frames between two keyframes, in place, what refinement changed from one to the other.
+    """Distribute a refinement's change between two keyframes over the frames in between, in place.
 
-    A frame keeps the way from its keyframe as it was tracked, in the scale that the map had just there. Where
-    refinement then moved the next keyframe, all frames before it would be off by more and more, and jump back at it.
+    A frame keeps its tracked pose relative to its keyframe. After a refinement of the next keyframe, the error of
+    frames would grow towards it, with a jump at it.
 
     Args:
         records: Of consecutive frames.
         T_c_w: Their poses ``(F, 4, 4)`` by their own keyframes.
         T_k_w: World-to-camera pose of each keyframe.
-        own: Whether a frame stands where the keyframe does that it is tied to ``(F,)``: those of a map's beginning were
-            not tracked before they became keyframes.
+        own: Whether a frame is the reference keyframe itself ``(F,)``; the first ones of a map were not tracked before.
     """
     begin = 0
     for i, record in enumerate(records):
@@ -160,7 +158,7 @@ def _close_gaps(
 
 
 def _way(T_c_w: FloatArray) -> FloatArray:
-    """Length of the way to each of some poses ``(F,)``; a wrong scale grows with it. Equal steps where none moved."""
+    """Path length up to each of some poses ``(F,)``; equal steps without motion."""
     steps = np.linalg.norm(np.diff(se3.inverse(T_c_w)[:, :3, 3], axis=0), axis=1)
     if not steps.any():
         steps = np.ones_like(steps)

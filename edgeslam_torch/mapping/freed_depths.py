@@ -1,4 +1,4 @@
-r"""What a window gains by depths that follow noise: a camera that turns must not seem to have moved.
+r"""Correction of the bias of a window's cost by free depths: a rotating camera must not appear to move.
 
 Refinement minimises over poses *and* depths. While depths rest on priors, its minimum is biased: from a shifted camera
 every depth can follow its pixel's noise, from a turned one none can. So it lies at a baseline at which one sigma of
@@ -40,7 +40,7 @@ class Weight(IntEnum):
 
 
 def motion_priors(problem: WindowProblem, weight: Weight) -> tuple[RelativePosePrior, ...]:
-    """Priors on the motions between hosts and observers of a window's anchors on priors, at its poses as they are.
+    """Priors on the motions between hosts and observers of a window's anchors on priors, at the present poses.
 
     Their mean is no translation; rotations are free.
     """

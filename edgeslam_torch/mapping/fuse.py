@@ -21,14 +21,14 @@ Pairs = tuple[IntArray, IntArray]
 
 
 def fuse_young(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
-    """Search a keyframe's young anchors in its neighbours; `fuse_all` searches all."""
+    """Search a keyframe's new anchors in its neighbours; `fuse_all` searches all."""
     ids = slam_map.anchors_seen_by([keyframe])
     young = ids[slam_map.anchors.born[ids] > keyframe.id - YOUNG]
     merge(slam_map, [_look_in(slam_map, camera, k, young) for k in neighbours])
 
 
 def fuse_all(slam_map: SlamMap, camera: Camera) -> None:
-    """Search every anchor in every keyframe of its piece, after all poses are refined."""
+    """Search every anchor in every keyframe of its submap, after all poses are refined."""
     anchors = slam_map.anchors
     for keyframe in slam_map.keyframes.values():
         piece = slam_map.piece_of(keyframe.id)
@@ -61,7 +61,7 @@ def look_for(
         Found anchors ``(M,)``, their keypoints ``(M,)``, and predicted minus observed pixels ``(M, 2)``.
     """
     anchors = slam_map.anchors
-    held = np.zeros(len(anchors.alive) + 1, dtype=bool)  # the last row stands for NO_ANCHOR
+    held = np.zeros(len(anchors.alive) + 1, dtype=bool)  # the last row is for NO_ANCHOR
     held[keyframe.anchor] = True
     ids = ids[~held[ids]]
     seen = project_anchors(anchors, ids, keyframe.T_c_w, camera, slam_map.scale_factor, slam_map.levels)

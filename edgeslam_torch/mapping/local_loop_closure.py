@@ -62,12 +62,12 @@ def revisit_candidate(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
 
 
 def reobserve(slam_map: SlamMap, camera: Camera, keyframe: Keyframe) -> float | None:
-    """Rejoin a keyframe with an old one that observed the same place, if one is found and verified.
+    """Match a keyframe with an old one of the same place, if one is found and verified.
 
-    The map is not refined here; until then, joined observations disagree by the drift.
+    The map is not refined here; until then, merged observations differ by the drift.
 
     Returns:
-        The drift: median distance [px] of the old anchors from their projections; None if nothing was joined.
+        The drift: median distance [px] of the old anchors from their projections; None without a match.
     """
     old = revisit_candidate(slam_map, keyframe)
     if old is None:

@@ -38,7 +38,7 @@ few that a drifted one swings past the truth."""
 WIDE_EVERY = 4
 """Windows until the next wide one: about a second in flight."""
 WIDE_STEPS = 100
-"""Limit of the solver's steps in it: some 15 are usual, the first one after a long drift takes several times that."""
+"""Maximum number of solver steps: 15 are typical, the first run after a long drift takes several times that."""
 ENOUGH_ANCHORS = 300
 """Number of anchors below which empty regions of a keyframe are filled from the depth prior alone."""
 EMPTY_RADIUS_PX = 25.0
@@ -81,12 +81,12 @@ class Mapper:
         """Insert a new keyframe: cull, triangulate, fuse, rejoin, refine.
 
         Args:
-            keyframe: Already in the map; ``keyframe.anchor`` holds what tracking matched.
+            keyframe: Already in the map; ``keyframe.anchor`` has the matches of tracking.
             colour: RGB of each keypoint, ``(N, 3)`` uint8.
-            telemetry: What may take part in the refinement.
+            telemetry: For the refinement.
 
         Returns:
-            What the window refinement reports, or None when there was nothing to refine.
+            Result of the window refinement, or None without any.
         """
         with self.map.lock:
             self.map.anchors.begin_pass()
@@ -115,7 +115,7 @@ class Mapper:
     def _take_back_drift(self, keyframe: Keyframe, telemetry: TelemetryModel) -> None:
         """Refine the recent map with telemetry every few keyframes.
 
-        The fixed keyframes around a window hold its scale, right or drifted, against telemetry.
+        Fixed keyframes around a window keep its scale, right or drifted, against telemetry.
         """
         self._windows += 1
         if self._windows < WIDE_EVERY:
@@ -130,7 +130,7 @@ class Mapper:
         take_along(self.map, keyframes, before)
 
     def cull_recent_anchors(self, keyframe: Keyframe) -> None:
-        """Remove young anchors that tracking rarely finds or that only two keyframes observe."""
+        """Remove new anchors that tracking rarely finds or that only two keyframes observe."""
         anchors = self.map.anchors
         recent = self._recent[anchors.alive[self._recent]]
         age = keyframe.id - anchors.born[recent]
@@ -261,7 +261,7 @@ class Mapper:
             self.map.remove_keyframe(needless)
 
     def _most_needless(self, newest: Keyframe) -> Keyframe | None:
-        """The keyframe outside the window whose removal costs the smallest share of what it shows; ties to the oldest.
+        """The most redundant keyframe outside the window; ties to the oldest.
 
         None while each is the only view of its place, until there are twice as many as `MappingConfig.max_keyframes`.
         """

@@ -98,7 +98,7 @@ def triangulate_matches(
         ok = np.isfinite(p_k).all(1) & (p_k[:, 2] > 0) & (p_o[:, 2] > 0) & (angle > min_parallax_rad)
         ok &= ((camera.project(p_k) - uv_k) ** 2).sum(1) <= CHI2_2DOF_95 * sigma_k**2
         ok &= ((camera.project(p_o) - uv_o) ** 2).sum(1) <= CHI2_2DOF_95 * sigma_o**2
-        level_ratio = sigma_o / sigma_k * d_o / d_k  # 1 when the same patch fills both pyramid levels alike
+        level_ratio = sigma_o / sigma_k * d_o / d_k  # 1 when a patch has the same size in both pyramid levels
         ok &= (level_ratio < 1.5 * scale_factor) & (level_ratio > 1.0 / (1.5 * scale_factor))
     ok = np.flatnonzero(ok)
     sigma_depth = d_k[ok] * np.maximum(sigma_k[ok], sigma_o[ok]) / (camera.fx * np.maximum(angle[ok], 1e-6))

@@ -1,4 +1,4 @@
-"""From a frame that became a keyframe to its part in the map: image, depth, anchors, refinement, edges.
+"""Processing of a new keyframe: image, depth, anchors, refinement, edges.
 
 At once, or on the one thread of an executor while the next frames are tracked.
 """
@@ -29,7 +29,7 @@ class Mapped:
 
 
 class MappingPipeline:
-    """Maps keyframes, one lot at a time.
+    """Maps keyframes, one batch at a time.
 
     Args:
         mapper: Anchors and refinement.
@@ -52,7 +52,7 @@ class MappingPipeline:
         self.camera = camera
         self.depth = depth
         self.has_metres = False
-        """Whether the depth network has said metres yet."""
+        """Whether the depth network has given metres yet."""
         self._executor = executor
         self._pending: Future[Mapped] | None = None
 
@@ -69,7 +69,7 @@ class MappingPipeline:
         return None
 
     def collect(self, wait: bool = False) -> Mapped | None:
-        """What was submitted, once it is done; None before, or when nothing was."""
+        """Result of the last submission once it is done; None before, or without one."""
         if self._pending is None or not (wait or self._pending.done()):
             return None
         pending, self._pending = self._pending, None

@@ -1,4 +1,4 @@
-"""Anchors whose depth rests on a prior: where the camera turns, hovers or looks far, parallax comes late or never.
+"""Anchors with a depth prior, for cameras with little parallax: rotation, hover, distant scenes.
 
 Such an anchor has a host keyframe, along whose ray the depth network (or its neighbours) expects it at an inverse depth
 with a standard deviation. Refinement takes the expectation as one more measurement, as a stereo camera would give it;
@@ -72,11 +72,11 @@ def add_on_prior(
     """New anchors on keypoints ``(M,)`` of a host keyframe, which observes them.
 
     Args:
-        slam_map: Takes them.
+        slam_map: Receives them.
         camera: Intrinsics.
         keyframe: The host, in the map.
         keypoint: Free keypoints of it.
-        inverse_depth: Where to put them ``(M,)`` [1/map unit].
+        inverse_depth: Initial inverse depth ``(M,)`` [1/map unit].
         prior: Expected inverse depth and standard deviation ``(M, 2)``.
         colour: RGB ``(M, 3)``.
 

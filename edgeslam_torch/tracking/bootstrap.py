@@ -30,17 +30,17 @@ logger = logging.getLogger(__name__)
 WITNESS_SHARE = 0.6
 """Minimum share of inliers in the frames between: correct structures reach 0.8 to 0.95 (95 % of correct matches)."""
 
-ALIKE_COST = 1.2
+MAX_COST_RATIO = 1.2
 """Maximum ratio of the costs of two structures that both explain the images: four standard deviations of a chi-square
 with several hundred degrees of freedom."""
 
 OTHER_SAMPLES = 4
-"""Further random samples of the matches that must say the same of two views that no frame between confirms: where each
-second sample says otherwise, fifteen of sixteen such views are refused."""
+"""Further random samples of the matches that must agree on two views without confirmation by intermediate frames: if
+every second sample disagrees, fifteen of sixteen such views are rejected."""
 
 SAME_PICTURE_PX = 1.0
-"""Median motion of the keypoints up to which a frame is the reference's picture once more. A still camera, or a video
-that repeats a picture, matches all of them, by which no later frame may be measured."""
+"""Median motion of the keypoints up to which a frame shows the reference's view. A static camera, or a repeated image,
+matches all keypoints, which is no standard for later frames."""
 
 AGREEING_SHARE = 0.8
 """The same after joint refinement of all frames: 95 % if every match were correct, less a sixth of wrong matches."""
@@ -133,7 +133,7 @@ class Bootstrap:
         return track
 
     def _moved_px(self, view: View, track: Track) -> float:
-        """Median distance of matched keypoints from their places in the reference [px]."""
+        """Median displacement of matched keypoints relative to the reference [px]."""
         uv = self.reference.features.uv[self._reference_keypoints(track)]
         return float(np.median(np.linalg.norm(view.features.uv[track.matched_keypoint] - uv, axis=1)))
 
@@ -180,7 +180,7 @@ class Bootstrap:
         return two_view_map(self.reference, self.guess_depth, view, reference_keypoint, keypoint, camera, config, seed)
 
     def _same_direction(self, a: TwoView, b: TwoView) -> bool:
-        """Whether two structures move the camera alike, within what two directions as unsure as allowed differ by."""
+        """Whether two structures agree on the camera motion, within the allowed uncertainty of both directions."""
         one, other = (se3.inverse(two_view.T_c_w)[:3, 3] - self.reference.centre_w for two_view in (a, b))
         cosine = float(one @ other) / float(np.linalg.norm(one) * np.linalg.norm(other))
         return cosine > np.cos(np.sqrt(2.0) * self.config.max_direction_sigma)
@@ -219,7 +219,7 @@ class Bootstrap:
         A small rotation and a small translation have similar image motion, so the cost has two minima: the right one,
         and a flatter scene with a larger rotation.
         """
-        if max(a.cost, b.cost) > ALIKE_COST * min(a.cost, b.cost):
+        if max(a.cost, b.cost) > MAX_COST_RATIO * min(a.cost, b.cost):
             return a if a.cost < b.cost else b
         return a if self._unlike_network(a) <= self._unlike_network(b) else b
 
@@ -281,7 +281,7 @@ class Bootstrap:
         new.append((frame, second))
         for _, keyframe in new:
             self.map.add_keyframe(keyframe)
-        # The essential matrix has no scale: refinement holds the extent given by the predicted depths.
+        # The essential matrix has no scale: refinement keeps the extent given by the predicted depths.
         refine(self.map, Window([k for _, k in new], [reference], ids), self.tracker.camera, lm)
         self.map.refresh_anchors(ids[self.map.anchors.alive[ids]])
         poses = self._poses_between({v.frame_index for v in self.views}) | {k.frame_index: k.T_c_w for _, k in new[:-1]}

@@ -81,7 +81,7 @@ class Followed:
     share: float
     """Share of inliers among the selected keypoints."""
     trusted: bool
-    """Whether enough of those in view are inliers to tell a pose; else it tells where to look for one."""
+    """Whether enough of those in view are inliers for a pose; otherwise it is only a prediction."""
 
 
 def template_of_keyframe(keyframe: Keyframe, grey: NDArray[np.uint8]) -> Template:

@@ -17,21 +17,21 @@ SHORTEST_GAP_S = 0.04
 """Minimum time between keyframes whatever the change of view: every second frame at 30 Hz, every frame at 20."""
 
 OLD_S = 10.0
-"""Age from which on a keyframe counts as one of an earlier visit: a hand that waves, or a turn on the spot, brings
-another view of what it is looking at, which the map profits from (docs/decisions/03-keyframes.md)."""
+"""Age from which on a keyframe belongs to an earlier visit; younger ones of a shaking hand or of a rotation in place
+are other views of the same visit, which improve the map (docs/decisions/03-keyframes.md)."""
 KNOWN_SHARE = 0.8
-"""Share of a view that earlier visits must have seen for it to add nothing: 0.81 and more from the third pass over a
-place on, below 0.05 on new ground."""
+"""Share of a view already covered by earlier visits from which on a keyframe is redundant: 0.81 and more from the third
+pass over a place on, below 0.05 in new places."""
 VISITS = 10
-"""Keyframes of earlier visits that are asked: those that see most of the same."""
+"""Number of keyframes of earlier visits that are compared, the most covisible ones."""
 LONG_AGO_S = 30.0
-"""Age from which on a keyframe counts as one of a visit that is over: what the drone flies over now it has left."""
-ALIKE_RAD = np.deg2rad(15.0)
+"""Age from which on a keyframe belongs to a completed visit."""
+MAX_VIEW_ANGLE_RAD = np.deg2rad(15.0)
 """Angle between two views of a place up to which their keypoints are recognised."""
-ALIKE_LEVELS = 2
-"""Pyramid levels between them up to which they are."""
+MAX_LEVEL_DIFFERENCE = 2
+"""Difference of pyramid levels up to which they are."""
 CHANCE = 0.05
-"""Probability below which anchors that are expected and not found are a change of the place, not chance."""
+"""Probability below which missing anchors indicate a change of the place."""
 
 
 def lost_sight(followed: Followed, config: MappingConfig) -> bool:
@@ -45,7 +45,7 @@ def lost_most(followed: Followed, config: MappingConfig) -> bool:
 
 
 def due_by_flow(followed: Followed, parallax_rad: float, since_keyframe_s: float, config: MappingConfig) -> bool:
-    """Whether a frame that was followed should become a keyframe; arguments as in `is_due`."""
+    """Whether a frame tracked by flow should become a keyframe; arguments as in `is_due`."""
     changed, at_once = lost_sight(followed, config), lost_most(followed, config)
     return is_due(changed, parallax_rad, since_keyframe_s, config, at_once)
 
@@ -82,7 +82,7 @@ def is_due(
 def known_share(
     track: Track, uv: FloatArray, stamp_s: float, slam_map: SlamMap, camera: Camera, config: MappingConfig
 ) -> float:
-    """Share of a view, in cells with keypoints, of which keyframes of earlier visits have seen what there is to see.
+    """Share of a view, in cells with keypoints, that keyframes of earlier visits cover.
 
     Two kinds of cells are known. A triangulated anchor was found in it that a keyframe of an earlier visit has seen at
     less parallax than makes a keyframe, and less than a pyramid level nearer or farther: a keyframe here would see
@@ -104,7 +104,7 @@ def known_share(
     visits = [slam_map.keyframes[id] for id in order if stamp_s - slam_map.keyframes[id].stamp_s >= OLD_S]
     long_ago = [k for k in visits if stamp_s - k.stamp_s >= LONG_AGO_S]
     seen = _seen_by(visits[:VISITS], track.T_c_w, slam_map, np.deg2rad(config.keyframe_parallax_deg), 1)
-    expected = _seen_by(long_ago[:VISITS], track.T_c_w, slam_map, ALIKE_RAD, ALIKE_LEVELS)
+    expected = _seen_by(long_ago[:VISITS], track.T_c_w, slam_map, MAX_VIEW_ANGLE_RAD, MAX_LEVEL_DIFFERENCE)
     known = _keypoints_a_cell(camera, uv[keypoint[seen[anchor]]]) > 0
     known |= _as_expected(np.flatnonzero(expected), track, slam_map, camera)
     filled = _keypoints_a_cell(camera, uv) > 0
@@ -114,7 +114,7 @@ def known_share(
 def _seen_by(
     keyframes: list[Keyframe], T_c_w: FloatArray, slam_map: SlamMap, max_rad: float, levels: int
 ) -> NDArray[np.bool_]:
-    """Which anchors are triangulated and seen by keyframes as a camera would: within an angle and pyramid levels."""
+    """Which anchors are triangulated and observed from a similar direction and distance."""
     anchors, centre = slam_map.anchors, se3.inverse(T_c_w)[:3, 3]
     seen = np.zeros(len(anchors.alive), dtype=bool)
     for keyframe in keyframes:
@@ -129,7 +129,7 @@ def _seen_by(
 
 
 def _as_expected(expected: IntArray, track: Track, slam_map: SlamMap, camera: Camera) -> NDArray[np.bool_]:
-    """Cells in which anchors ``(M,)`` are expected; not those where none of many is found, which is no chance."""
+    """Cells in which anchors ``(M,)`` are expected, without those where significantly many are missing."""
     p_c = se3.transform(track.T_c_w, slam_map.anchors.p_w[expected])
     expected, p_c = expected[p_c[:, 2] > 0], p_c[p_c[:, 2] > 0]
     uv = camera.project(p_c)
@@ -143,7 +143,7 @@ def _as_expected(expected: IntArray, track: Track, slam_map: SlamMap, camera: Ca
 
 
 def _keypoints_a_cell(camera: Camera, uv: FloatArray) -> IntArray:
-    """Number of pixels ``(N, 2)`` in each cell of the image; undistorted ones may lie beside it."""
+    """Number of pixels ``(N, 2)`` in each cell of the image; undistorted ones may be outside."""
     column, row = np.floor(uv / (np.array([camera.width, camera.height]) / GRID)).astype(np.int64).T
     inside = (column >= 0) & (column < GRID[0]) & (row >= 0) & (row < GRID[1])
     return np.bincount((column + GRID[0] * row)[inside], minlength=GRID[0] * GRID[1])

@@ -18,7 +18,7 @@ FADING = 0.8
 
 SPEED_M_S = 0.5
 ANGULAR_SPEED_RAD_S = 1.0
-"""Standard deviations of how they move while no velocity is known."""
+"""Standard deviations of the velocity while it is unknown."""
 
 
 class MotionModel:
@@ -36,7 +36,7 @@ class MotionModel:
 
     @property
     def velocity_unknown(self) -> bool:
-        """Whether no velocity is known."""
+        """Whether the velocity is unknown."""
         return not np.any(self._velocity)
 
     def predict(self, stamp_s: float) -> FloatArray:
@@ -47,9 +47,7 @@ class MotionModel:
     def pose_prior(self, stamp_s: float, T_predicted: FloatArray, metres_per_unit: float) -> PosePrior:
         """A predicted pose with its uncertainty due to accelerations since the newest frame."""
         dt = stamp_s - self.stamp_s
-        speed, turn = (
-            (SPEED_M_S, ANGULAR_SPEED_RAD_S) if self.velocity_unknown else (0.0, 0.0)
-        )  # it may have moved all the time
+        speed, turn = (SPEED_M_S, ANGULAR_SPEED_RAD_S) if self.velocity_unknown else (0.0, 0.0)  # it may be moving
         sigma_t = math.hypot(speed * dt, 0.5 * ACCELERATION_M_S2 * dt**2) / metres_per_unit
         sigma_r = math.hypot(turn * dt, 0.5 * ANGULAR_ACCELERATION_RAD_S2 * dt**2)
         return PosePrior(0, T_predicted, np.diag([sigma_t**-2] * 3 + [sigma_r**-2] * 3))

@@ -22,27 +22,26 @@ MIN_MATCHES = 20
 LIKELY_SHARE = 0.12
 """Minimum share of found anchors among those in view (or among the frame's keypoints, if fewer) of a likely place.
 Wrong places reach 0.09 in a corridor whose doors repeat and 0.06 in furnished rooms; right ones have 0.2 and more in
-95 % of redkitchen's frames (docs/decisions/18-relocalisation.md)."""
+95 % of frames of an office recording (docs/decisions/18-relocalisation.md)."""
 SURE_SHARE = 0.2
 """The same for a place within reach that needs no further confirmation. While the reachable region is a single place,
 as in the first 0.2 s, a likely one is accepted."""
 GRID = (8, 6)
 """Grid of cells for measuring the spread over the image."""
 MIN_CELLS = 6
-"""Minimum number of cells with an inlier: one picture on the wall fills four."""
+"""Minimum number of cells with an inlier: a single poster fills four."""
 LIKELY_SPREAD = 0.3
-"""Minimum share of cells with an inlier among those with an anchor in view: 0.24 at a wrong place of the boards, 0.4
-and more at right ones."""
+"""Minimum share of cells with an inlier among those with an anchor in view: 0.24 at wrong
+places, 0.4 and more at right ones."""
 AGREEING_FRAMES = 3
 """Consecutive frames that must agree on a likely place."""
 RIVAL = 0.6
 """Share of the best place's inliers above which another place is a rival."""
-APART = 0.15
+MAX_DISTANCE = 0.15
 """Maximum distance of two poses of one place, relative to the scene depth; also of consecutive frames."""
-MAX_APART_RAD = np.deg2rad(20.0)
-NEXT_ALIKE = 1.0 / 3.0
-"""Distance, relative to the scene depth, within which nothing repeats that fills 30 % of the image: doors every 1.9 m
-are seen from 3 to 5 m."""
+MAX_ANGLE_RAD = np.deg2rad(20.0)
+MIN_PERIOD = 1.0 / 3.0
+"""Minimum period of repetitive structure relative to the scene depth: doors every 1.9 m, seen from 3 to 5 m."""
 ACCELERATION_M_S2 = 9.0
 ANGULAR_ACCELERATION_RAD_S2 = 60.0
 """Bounds for a hand or a small drone: three times the standard deviations of the motion model."""
@@ -63,17 +62,17 @@ class Reach:
     def holds(self, place: "Place") -> bool:
         """Whether a place is within reach, with a tolerance."""
         shift, turn = pose_difference(place.track.T_c_w, self.T_c_w)
-        near = shift <= self._shift(place.depth) + APART * place.depth
-        return near and turn <= self.turn_rad + MAX_APART_RAD
+        near = shift <= self._shift(place.depth) + MAX_DISTANCE * place.depth
+        return near and turn <= self.turn_rad + MAX_ANGLE_RAD
 
     def leaves_only(self, place: "Place") -> bool:
         """Whether no other place like this one can be meant: all that is within reach is one place, or it is where the
         camera is expected and the next one like it is out of reach."""
         near = self._shift(place.depth)
-        if near <= APART * place.depth:
+        if near <= MAX_DISTANCE * place.depth:
             return self.holds(place)
         shift, turn = pose_difference(place.track.T_c_w, self.T_c_w)
-        return near <= NEXT_ALIKE * place.depth and shift <= APART * place.depth and turn <= MAX_APART_RAD
+        return near <= MIN_PERIOD * place.depth and shift <= MAX_DISTANCE * place.depth and turn <= MAX_ANGLE_RAD
 
     def _shift(self, depth: float) -> float:
         return self.shift_m * (self.metre or depth / 3.0)
@@ -102,7 +101,7 @@ class Place:
     def is_as(self, other: "Place") -> bool:
         """Whether two poses belong to one place."""
         shift, turn = pose_difference(self.track.T_c_w, other.track.T_c_w)
-        return shift <= APART * min(self.depth, other.depth) and turn <= MAX_APART_RAD
+        return shift <= MAX_DISTANCE * min(self.depth, other.depth) and turn <= MAX_ANGLE_RAD
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,8 +38,7 @@ _CHECKED_PAIRS = 120
 """Number of keyframe pairs for checking a calibration: half a second of CPU, once per run."""
 _CHECKED_GAPS = (1, 2, 3)
 _MIN_CHECKED = 10
-"""Minimum number of pairs to contradict a calibration: seven pairs of tum_fr1_xyz suggest an error of 25 % for the
-right one."""
+"""Minimum number of pairs to contradict a calibration; seven pairs may suggest an error of 25 % for a correct one."""
 _CONTRADICTION_SIGMAS = 2.5
 _CONTRADICTION = 0.15
 """Minimum relative difference of a contradiction. On eight recordings, right focal lengths are estimated within 7 %
@@ -48,7 +47,7 @@ icsl_corridor (planes), and euroc_mh05_a, whose strong distortion compensates a 
 detects them on tum_fr1_xyz, too (1.23 and 0.84 for 1.43 and 0.77), and finds right ones within 1.3 % on five
 recordings and 10 % off on planes (fr3_notexture_a)."""
 _MIN_REFINED = 20
-"""Keyframes: a dozen of a sideways step fit half the focal length at other depths, and their sigma says nothing."""
+"""Keyframes: a dozen of a sideways step fit half the focal length at other depths, with a meaningless sigma."""
 _REFINED_KEYFRAMES, _REFINED_ANCHORS = 40, 600
 """Of the map, for a refinement with a free focal length: up to 1.5 s of CPU, once per run."""
 _REFINEMENT = LmConfig(diagnostics=False, max_iterations=30, mu=1e-8, cost_tolerance=1e-6)

@@ -58,9 +58,9 @@ def test_a_climb_before_guessed_depths_is_a_climb_by_the_drones_attitude(wall):
 
 
 def test_a_pose_that_is_held_is_no_surer_than_its_image(wall):
-    held, free = solved(wall, Vertical(LEVEL[:3, 2], 0.0)), solved(wall, None)
-    assert not np.allclose(held.T_c_w, free.T_c_w)
-    np.testing.assert_array_equal(held.covariance, free.covariance)
+    constrained, free = solved(wall, Vertical(LEVEL[:3, 2], 0.0)), solved(wall, None)
+    assert not np.allclose(constrained.T_c_w, free.T_c_w)
+    np.testing.assert_array_equal(constrained.covariance, free.covariance)
 
 
 def test_a_vertical_that_the_image_contradicts_does_not_count(wall):
@@ -70,9 +70,9 @@ def test_a_vertical_that_the_image_contradicts_does_not_count(wall):
 
 def test_a_vertical_that_turned_fast_says_little(wall):
     off = tilted(0.7)[:3, 2]
-    held, doubtful = (solved(wall, Vertical(off, doubt)).T_c_w for doubt in (0.0, math.radians(20.0)))
+    constrained, doubtful = (solved(wall, Vertical(off, doubt)).T_c_w for doubt in (0.0, math.radians(20.0)))
     free = solved(wall, None).T_c_w
-    assert tilt_deg(held) == pytest.approx(0.7, abs=0.05)
+    assert tilt_deg(constrained) == pytest.approx(0.7, abs=0.05)
     assert abs(tilt_deg(doubtful) - tilt_deg(free)) < 0.1
 
 
@@ -137,8 +137,8 @@ def test_a_climb_before_a_wall_that_leans_in_the_map_is_one_that_the_drone_has_m
     true = np.array([0.0, 0.0, CLIMB_M])
     free = centre_of(before_the_wall(papered, None))
     assert abs(free[2] - CLIMB_M) > 0.1
-    held = centre_of(before_the_wall(papered, at(true)))
-    np.testing.assert_allclose(np.abs(held - true).max(), 0.05, atol=0.005)
+    constrained = centre_of(before_the_wall(papered, at(true)))
+    np.testing.assert_allclose(np.abs(constrained - true).max(), 0.05, atol=0.005)
     np.testing.assert_array_equal(centre_of(before_the_wall(papered, at(free))), free)
 
 
@@ -146,13 +146,13 @@ def test_a_pose_that_is_held_at_a_place_is_as_unsure_as_that(papered):
     """The images say something else: along the axes that are held its sigma is the doubt, and no other changes."""
     free = before_the_wall(papered, None)
     place = at(np.array([0.0, 0.0, CLIMB_M]))
-    held = before_the_wall(papered, place)
+    constrained = before_the_wall(papered, place)
     left = place.beyond(free.T_c_w) != 0
     to_axes = AXES @ free.T_c_w[:3, :3].T
-    added = to_axes @ (held.covariance - free.covariance)[:3, :3] @ to_axes.T
+    added = to_axes @ (constrained.covariance - free.covariance)[:3, :3] @ to_axes.T
     np.testing.assert_allclose(added, np.diag(np.where(left, 0.05**2, 0.0)), atol=1e-12)
     assert left.any() and not left.all()
-    np.testing.assert_array_equal(held.covariance[3:], free.covariance[3:])
+    np.testing.assert_array_equal(constrained.covariance[3:], free.covariance[3:])
 
 
 def test_what_cannot_be_solved_is_not_held(papered):
@@ -183,7 +183,7 @@ def test_what_is_beyond_a_place_is_measured_along_its_axes():
 
     np.testing.assert_array_equal(place.beyond(from_centre(inside)), np.zeros(3))
     np.testing.assert_allclose(place.beyond(from_centre(beyond)), [0.4, -0.3, 0.01], atol=1e-12)
-    prior = place.held(from_centre(beyond), PosePrior(0, np.eye(4), np.zeros((6, 6))))
+    prior = place.constrained(from_centre(beyond), PosePrior(0, np.eye(4), np.zeros((6, 6))))
     np.testing.assert_allclose(AXES @ se3.inverse(prior.T_c_w)[:3, 3], [1.1, 1.8, 3.3], atol=1e-12)
     np.testing.assert_allclose(prior.T_c_w[:3, :3], T[:3, :3], atol=1e-12)
 
@@ -191,7 +191,7 @@ def test_what_is_beyond_a_place_is_measured_along_its_axes():
 def test_a_place_holds_only_the_axes_along_which_a_pose_has_left_it():
     place = Place(AXES, np.zeros(3), np.full(3, 0.1))
     T = np.block([[np.eye(3), -(AXES.T @ [0.0, 0.0, 0.5])[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
-    information = place.held(T, PosePrior(0, np.eye(4), np.zeros((6, 6)))).information
+    information = place.constrained(T, PosePrior(0, np.eye(4), np.zeros((6, 6)))).information
     along, across = AXES[2], AXES[0]
     assert along @ information[:3, :3] @ along == pytest.approx(1.0 / 0.002**2)
     assert across @ information[:3, :3] @ across == pytest.approx(0.0, abs=1e-6)
