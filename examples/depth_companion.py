@@ -37,7 +37,7 @@ class Depth:
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         try:
             self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime has a dozen, with no class of its own above them
+        except Exception as error:  # onnxruntime's exceptions share no base class of their own
             raise ValueError(f"{path}: not a model that onnxruntime reads ({error})") from error
         try:
             record = json.loads(self.session.get_modelmeta().custom_metadata_map["edgeslam"])

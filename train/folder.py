@@ -117,7 +117,7 @@ class OutFolder:
         return step
 
     def finished(self, given: Inputs) -> TrainingResult | None:
-        """Outcome of the training, if exactly this was done before."""
+        """Result of an identical earlier training, if any."""
         record = self._record()
         if record is None or record["outcome"] is None or self.existing is Existing.OVERWRITE:
             return None

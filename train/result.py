@@ -1,4 +1,4 @@
-"""Outcome of a fine-tuning, in numbers and words."""
+"""Result of a training."""
 
 import dataclasses
 from dataclasses import dataclass

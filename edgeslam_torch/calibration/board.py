@@ -155,7 +155,7 @@ def _find_aprilgrid(name: str, grey: np.ndarray, board: Board) -> View | None:
     """Corners of the visible tags of Kalibr's AprilGrid.
 
     Whether ids count from the lower or the upper row, and which corner of a tag comes first, differs between
-    programs; a homography tells.
+    programs; a homography decides.
     """
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     for border in (2, 1):  # Kalibr prints two bits of border, others one

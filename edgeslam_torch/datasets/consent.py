@@ -1,4 +1,4 @@
-"""Fetching by name: what it costs in disk, whose it is, and the user's consent before the first byte."""
+"""Download by name: disk space, licence, and the user's consent before the first byte."""
 
 import os
 import sys

@@ -105,7 +105,7 @@ def get(
         keep: Keep archives.
 
     Raises:
-        SourceError: If no address answers, the transfer breaks off, or the content is not what it should be.
+        SourceError: If no address answers, the transfer breaks off, or the checksum differs.
         OutputError: If the disk is full, or the folder cannot be written to.
         MissingPackageError: Without the ``[data]`` extra.
     """
@@ -187,7 +187,7 @@ class _Broken(Exception):
 
 
 class _Resuming:
-    """A downloader for pooch: its own ones begin anew after every interruption."""
+    """A downloader for pooch that resumes; pooch's own ones restart after every interruption."""
 
     def __init__(self, archive: Archive, progress: Progress) -> None:
         self._archive = archive

@@ -460,7 +460,7 @@ class Tello:
                 return
 
     def _answer(self, command: str, timeout_s: float, enough: Callable[[], bool] = lambda: False) -> str | None:
-        """The answer to a command; None when time is up, a landing is wanted, or what it should bring is seen."""
+        """The answer to a command; None on timeout, on a requested landing, or when its effect is observed."""
         deadline = self.clock.now() + timeout_s
         while not self._stopping.is_set() and (command in _PARTING or not self._over()):
             left = deadline - self.clock.now()

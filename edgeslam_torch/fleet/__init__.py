@@ -1,1 +1,1 @@
-"""Many recordings: each run, evaluated and reported in a process of its own, and one table of all."""
+"""Batches of recordings: each is run, evaluated and reported in its own process; one table of all."""

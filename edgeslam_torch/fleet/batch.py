@@ -44,7 +44,7 @@ class Local:
     processes: int
     limits: Limits
     retries: int = 1
-    """For a process that was killed by somebody else."""
+    """Repetitions after a process was killed from outside."""
     start: Start = start_flight
 
     def __call__(self, tasks: Sequence[Task], prepare: Callable[[Task], Path]) -> Generator[tuple[Task, Ended]]:

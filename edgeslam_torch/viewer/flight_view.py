@@ -15,12 +15,12 @@ from edgeslam_torch.types import FloatArray
 from edgeslam_torch.viewer.rerun_viewer import check_writable
 
 _EVERY_S = 0.5
-"""Between two pictures of the space: it is some thousand cells."""
+"""Interval between updates of the occupancy: some thousand cells each."""
 _FREE, _SOLID, _WAY, _FLOWN, _EXIT = (120, 170, 200, 60), (60, 60, 60), (217, 145, 43), (47, 127, 184), (200, 64, 47)
 
 
 class FlightView:
-    """A listener of `Navigator.open` that shows each moment.
+    """A listener of `Navigator.open` that shows each control cycle.
 
     Args:
         name: Title of the recording.
@@ -48,11 +48,11 @@ class FlightView:
         self._revision, self._words = 0, ""
 
     def __call__(self, moment: Moment) -> None:
-        """Show a moment."""
+        """Show a control cycle."""
         state, rr = moment.state, self._rr
         if math.isnan(self._began_s):
             self._began_s = state.stamp_s
-        if state.revision != self._revision:  # the earlier way is in another unit
+        if state.revision != self._revision:  # the earlier path is at another scale
             self._revision, self._flown = state.revision, []
         self._stream.set_time("time", duration=state.stamp_s - self._began_s)
         self._flown.append(state.p_w.copy())
@@ -117,7 +117,7 @@ def _layout(rrb: Any) -> Any:
     """Layout of the window."""
     beside = rrb.Vertical(
         rrb.TimeSeriesView(origin="speed", name="speed: flown, wanted, limit [m/s]"),
-        rrb.TextLogView(origin="reasons", name="what it does, and why"),
+        rrb.TextLogView(origin="reasons", name="phase and reason"),
     )
-    scene = rrb.Spatial3DView(origin="world", name="space and way")
+    scene = rrb.Spatial3DView(origin="world", name="space and path")
     return rrb.Blueprint(rrb.Horizontal(scene, beside, column_shares=[6, 4]), collapse_panels=True)

@@ -48,7 +48,7 @@ def test_table_is_printed_written_and_compared(data, tmp_path, capsys):
     ("arguments", "message"),
     [
         (["--only", "desk*"], "no cell matches; there are: stairs"),
-        (["--against", "nowhere"], "cannot be read as a judge's result"),
+        (["--against", "nowhere"], "nowhere/judge.json"),
         (["--thresholds", "nowhere.toml"], "cannot be read as thresholds"),
         (["--first-seed", "-1"], "--jobs and --seeds must be at least 1, --first-seed at least 0"),
         (["--release", "0.3.json"], "a release needs all of its recordings; missing: 7scenes_redkitchen, "),

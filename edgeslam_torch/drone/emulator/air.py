@@ -1,4 +1,4 @@
-"""What the air does to a small drone: drag, wind with gusts, the wash of its own propellers near walls and floor."""
+"""Aerodynamics of a small drone: drag, wind with gusts, propeller wash near walls and floor."""
 
 import math
 from dataclasses import dataclass, field

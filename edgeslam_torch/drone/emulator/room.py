@@ -21,7 +21,7 @@ Paint = Callable[[FloatArray], np.ndarray]
 def furnished_drone(
     seed: int, tilt_rad: float, size: tuple[int, int], battery: float = 1.0
 ) -> tuple[DroneModel, Paint, Camera]:
-    """A drone on the floor of a seeded room, the function that paints what it sees, and its camera.
+    """A drone on the floor of a seeded room, its renderer, and its camera.
 
     Args:
         seed: Of room and place.
