@@ -327,8 +327,8 @@ class EdgeSlam:
         self._system.fusion.revise(*self.log.poses())
         estimate = self.scale
         if np.isfinite(estimate.sigma):
-            held = self._system.published
-            self._system.published = OutputFrame(estimate.value, held.R, upright=held.upright)
+            before = self._system.published
+            self._system.published = OutputFrame(estimate.value, before.R, upright=before.upright)
         self._find_up()
         self._calibration_warning = calibration_warning(self.camera, self._shown_keyframes(), self.map.anchors.p_w)
 
@@ -475,7 +475,7 @@ class EdgeSlam:
         """Limits of the results, in sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
         map_mismatch = None if self._earlier is None else self._earlier.warning(self.support())
-        held = self._system.published.upright
+        upright = self._system.published.upright
         warnings = (
             self._machine.warning(),
             depth,
@@ -483,7 +483,7 @@ class EdgeSlam:
             map_mismatch,
             self._repeats.warning(self._system.fusion.flight.track.hovers),
             self._calibration_warning,
-            None if held or self.up is not None else self._system.fusion.orientation.leaning(),
+            None if upright or self.up is not None else self._system.fusion.orientation.leaning(),
         )
         return [warning for warning in warnings if warning is not None] + self._system.fusion.warnings()
 

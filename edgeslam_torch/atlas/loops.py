@@ -342,7 +342,7 @@ def _inv_sigma(shared: int, depth: float, distance: float) -> FloatArray:
     Args:
         shared: Number of keypoints.
         depth: Median depth in the keyframe [map units].
-        apart: Distance of the keyframes, relative to the depth.
+        distance: Distance of the keyframes, relative to the depth.
     """
     return np.sqrt(max(shared, 1)) * np.array([1.0 / depth] * 3 + [1.0] * 3 + [min(distance, 1.0)])
 

@@ -69,19 +69,19 @@ def depth_prior(
         anchors: All anchors.
         unknown_sigma_log: Sigma without a network.
     """
-    held = keyframe.keypoints_with_anchor()
-    p_w = anchors.p_w[keyframe.anchor[held]]
+    observed = keyframe.keypoints_with_anchor()
+    p_w = anchors.p_w[keyframe.anchor[observed]]
     z = (p_w @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
-    held, z = held[z > 0], z[z > 0]
-    if len(held) == 0:
+    observed, z = observed[z > 0], z[z > 0]
+    if len(observed) == 0:
         return np.full(len(uv), np.nan), np.full(len(uv), np.inf)
-    anchor_uv = keyframe.features.uv[held]
+    anchor_uv = keyframe.features.uv[observed]
     if keyframe.depth is not None:
         network, sigma = sample(keyframe.depth, uv)
         at_anchors, _ = sample(keyframe.depth, anchor_uv)
         fit: DepthFit | InverseFit | None
         if keyframe.depth.is_relative:  # anchors that rest on it would agree with any scale and shift
-            measured = ~anchors.from_depth[keyframe.anchor[held]]
+            measured = ~anchors.from_depth[keyframe.anchor[observed]]
             fit = fit_inverse(at_anchors[measured], z[measured])
             sigma = sigma if fit is None else fit.sigma(network)
         else:

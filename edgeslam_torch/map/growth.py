@@ -22,8 +22,8 @@ def depths(slam_map: SlamMap, keyframes: list[Keyframe]) -> Depths:
     """Present depths of the anchors in keyframes."""
     seen = {}
     for keyframe in keyframes:
-        held = keyframe.anchor[keyframe.anchor >= 0]
-        seen[keyframe.id] = held, se3.transform(keyframe.T_c_w, slam_map.anchors.p_w[held])[:, 2]
+        observed = keyframe.anchor[keyframe.anchor >= 0]
+        seen[keyframe.id] = observed, se3.transform(keyframe.T_c_w, slam_map.anchors.p_w[observed])[:, 2]
     return seen
 
 
@@ -39,13 +39,13 @@ def take_along(slam_map: SlamMap, keyframes: list[Keyframe], before: Depths) -> 
     grown = np.ones(len(anchors.alive))
     with slam_map.lock:
         for keyframe in keyframes:
-            held, z = before[keyframe.id]
-            now = se3.transform(keyframe.T_c_w, anchors.p_w[held])[:, 2]
-            good = anchors.alive[held] & (z > 0) & (now > 0)
+            observed, z = before[keyframe.id]
+            now = se3.transform(keyframe.T_c_w, anchors.p_w[observed])[:, 2]
+            good = anchors.alive[observed] & (z > 0) & (now > 0)
             if good.sum() < MIN_ANCHORS:
                 continue
             growth = float(np.exp(np.median(np.log(now[good] / z[good]))))
-            grown[held] = growth
+            grown[observed] = growth
             keyframe.scale(growth)
             hosted = np.flatnonzero(anchors.alive & anchors.from_depth & (anchors.host == keyframe.id))
             anchors.prior[hosted] /= growth

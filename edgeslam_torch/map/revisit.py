@@ -39,7 +39,7 @@ def is_back(earlier: list[Keyframe], recent: list[Keyframe], reach: FloatArray) 
 
 def _shared(members: list[Keyframe], earlier: int) -> NDArray[np.int32]:
     """Number of common anchors of keyframes with each of the first ones of them, ``(K, E)``."""
-    held = [k.anchor[k.anchor >= 0] for k in members]
-    row = np.repeat(np.arange(len(members)), [len(h) for h in held])
-    sees = csr_array((np.ones(len(row), np.int32), (row, np.concatenate(held))))
+    observed = [k.anchor[k.anchor >= 0] for k in members]
+    row = np.repeat(np.arange(len(members)), [len(h) for h in observed])
+    sees = csr_array((np.ones(len(row), np.int32), (row, np.concatenate(observed))))
     return np.asarray((sees @ sees[:earlier].T).toarray())

@@ -48,8 +48,8 @@ class SlamMap:
 
     def median_depth(self, keyframe: Keyframe) -> float | None:
         """Median depth of a keyframe's anchors [map units]; None without any in front of it."""
-        held = keyframe.anchor[keyframe.anchor >= 0]
-        z = se3.transform(keyframe.T_c_w, self.anchors.p_w[held])[:, 2]
+        observed = keyframe.anchor[keyframe.anchor >= 0]
+        z = se3.transform(keyframe.T_c_w, self.anchors.p_w[observed])[:, 2]
         return float(np.median(z[z > 0])) if (z > 0).any() else None
 
     def resolve(self, keyframe_id: int) -> tuple[int, FloatArray]:
@@ -130,11 +130,11 @@ class SlamMap:
         Anchors with fewer than two observations afterwards are removed; one suffices with a depth prior.
         """
         self.revision += 1
-        held = keyframe.anchor[keypoints]
-        keypoints, held = keypoints[held >= 0], held[held >= 0]
+        observed = keyframe.anchor[keypoints]
+        keypoints, observed = keypoints[observed >= 0], observed[observed >= 0]
         keyframe.anchor[keypoints] = NO_ANCHOR
-        self.anchors.observations[held] -= 1
-        poor = held[self.anchors.observations[held] < np.where(self.anchors.from_depth[held], 1, 2)]
+        self.anchors.observations[observed] -= 1
+        poor = observed[self.anchors.observations[observed] < np.where(self.anchors.from_depth[observed], 1, 2)]
         self.remove_anchors(poor)
 
     def remove_anchors(self, ids: IntArray) -> None:
@@ -247,17 +247,17 @@ class SlamMap:
         wanted[ids] = True
         wanted[-1] = False
         keyframes = list(self.keyframes.values())
-        held = np.concatenate([k.anchor for k in keyframes])
-        seen = np.flatnonzero(wanted[held])
-        held = held[seen]
+        observed = np.concatenate([k.anchor for k in keyframes])
+        seen = np.flatnonzero(wanted[observed])
+        observed = observed[seen]
         host = np.repeat(np.arange(len(keyframes)), [len(k.anchor) for k in keyframes])[seen]
-        ray = self.anchors.p_w[held] - np.stack([k.centre_w for k in keyframes])[host]
+        ray = self.anchors.p_w[observed] - np.stack([k.centre_w for k in keyframes])[host]
         distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
         ray /= distance[:, None]
-        total = np.stack([np.bincount(held, ray[:, i], len(wanted)) for i in range(3)], axis=1)[ids]
+        total = np.stack([np.bincount(observed, ray[:, i], len(wanted)) for i in range(3)], axis=1)[ids]
         norm = np.linalg.norm(total, axis=1)
         self.anchors.normal[ids] = total / np.where(norm > 0, norm, 1.0)[:, None]
         # Of several observations of one anchor the last assignment remains: the newest keyframe's.
         octave = np.concatenate([k.features.octave for k in keyframes])[seen]
-        self.anchors.max_distance[held] = distance * self.scale_factor**octave
-        self.anchors.words[held] = np.concatenate([k.words for k in keyframes])[seen]
+        self.anchors.max_distance[observed] = distance * self.scale_factor**octave
+        self.anchors.words[observed] = np.concatenate([k.words for k in keyframes])[seen]

@@ -70,9 +70,9 @@ def align(slam_map: SlamMap, keyframe: Keyframe, camera: Camera) -> int:
     keyframe.features.uv[mine[good]] = uv[good]  # in place: optical flow follows these very pixels
     keyframe.aligned_px[mine[good]] = np.hypot(SIGMA_PX * octave_px, sigma_px)[good]
     for look in looks:
-        held = look.theirs[np.isfinite(keyframe.aligned_px[look.mine])]
-        limit = SIGMA_PX * slam_map.scale_factor ** look.view.features.octave[held].astype(np.float64)
-        look.view.aligned_px[held] = np.fmin(look.view.aligned_px[held], limit)
+        observed = look.theirs[np.isfinite(keyframe.aligned_px[look.mine])]
+        limit = SIGMA_PX * slam_map.scale_factor ** look.view.features.octave[observed].astype(np.float64)
+        look.view.aligned_px[observed] = np.fmin(look.view.aligned_px[observed], limit)
     return int(good.sum())
 
 
@@ -106,8 +106,8 @@ def _first_seen(keyframe: Keyframe, known: list[Keyframe], anchors: int) -> tupl
     """A keyframe's keypoints ``(M,)`` whose anchors others see, which of ``known`` is the first, and its keypoints."""
     first, theirs = np.full(anchors, -1), np.zeros(anchors, dtype=np.int64)
     for i in reversed(range(len(known))):
-        held = known[i].keypoints_with_anchor()
-        first[known[i].anchor[held]], theirs[known[i].anchor[held]] = i, held
+        observed = known[i].keypoints_with_anchor()
+        first[known[i].anchor[observed]], theirs[known[i].anchor[observed]] = i, observed
     mine = keyframe.keypoints_with_anchor()
     mine = mine[first[keyframe.anchor[mine]] >= 0]
     return mine, first[keyframe.anchor[mine]], theirs[keyframe.anchor[mine]]

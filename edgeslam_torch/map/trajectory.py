@@ -147,8 +147,8 @@ def _close_gaps(
         if record.T_c_before is None:
             begin = i if own[i] else begin
             continue
-        held = records[begin].keyframe_id  # frames tied to another one need not be right where that one begins
-        if i - begin > 1 and all(r.supported and r.keyframe_id == held for r in records[begin:i]):
+        observed = records[begin].keyframe_id  # frames tied to another one need not be right where that one begins
+        if i - begin > 1 and all(r.supported and r.keyframe_id == observed for r in records[begin:i]):
             tracked = record.T_c_before @ T_k_w[records[i - 1].keyframe_id]
             moved = se3.log(T_c_w[i] @ se3.inverse(tracked))
             way = _way(np.concatenate([T_c_w[begin:i], tracked[None]]))

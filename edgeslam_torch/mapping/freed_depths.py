@@ -60,8 +60,8 @@ def motion_priors(problem: WindowProblem, weight: Weight) -> tuple[RelativePoseP
     T_o_h = problem.T_c_w[second] @ se3.inverse(problem.T_c_w[first])
     slope = _slopes(problem, mine, host) * priors.sigma[prior][:, None, None]
     moved = (slope @ T_o_h[group, :3, 3:])[:, :, 0]
-    told = np.bincount(prior, (moved * moved).sum(1), len(priors.anchor))  # I sigma^2
-    slope *= ((1.0 + told[prior]) ** (-0.5 * weight))[:, None, None]
+    gained = np.bincount(prior, (moved * moved).sum(1), len(priors.anchor))  # I sigma^2
+    slope *= ((1.0 + gained[prior]) ** (-0.5 * weight))[:, None, None]
     information = np.zeros((len(pair), 6, 6))
     np.add.at(information[:, :3, :3], group, np.swapaxes(slope, 1, 2) @ slope)
     T_o_h[:, :3, 3] = 0.0

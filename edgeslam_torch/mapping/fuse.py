@@ -61,9 +61,9 @@ def look_for(
         Found anchors ``(M,)``, their keypoints ``(M,)``, and predicted minus observed pixels ``(M, 2)``.
     """
     anchors = slam_map.anchors
-    held = np.zeros(len(anchors.alive) + 1, dtype=bool)  # the last row is for NO_ANCHOR
-    held[keyframe.anchor] = True
-    ids = ids[~held[ids]]
+    observed = np.zeros(len(anchors.alive) + 1, dtype=bool)  # the last row is for NO_ANCHOR
+    observed[keyframe.anchor] = True
+    ids = ids[~observed[ids]]
     seen = project_anchors(anchors, ids, keyframe.T_c_w, camera, slam_map.scale_factor, slam_map.levels)
     matches = match_projection(
         seen,
@@ -82,10 +82,10 @@ def look_for(
 def observe_or_pair(slam_map: SlamMap, keyframe: Keyframe, found: IntArray, keypoint: IntArray) -> Pairs:
     """Observe anchors ``(M,)`` on a keyframe's free keypoints; returns the others with the anchors of their
     keypoints."""
-    held = keyframe.anchor[keypoint]
-    free = held < 0
+    observed = keyframe.anchor[keypoint]
+    free = observed < 0
     slam_map.observe(keyframe, keypoint[free], found[free])
-    return found[~free], held[~free]
+    return found[~free], observed[~free]
 
 
 def _look_in(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, ids: IntArray) -> Pairs:

@@ -56,9 +56,9 @@ def revisit_candidate(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
     shift = np.linalg.norm(np.stack([k.centre_w for k in older]) - keyframe.centre_w, axis=1) / (MAX_SHIFT * depth)
     counts = slam_map.shared_counts(keyframe.anchor[keyframe.anchor >= 0])
     shared = np.array([counts.get(k.id, 0) for k in older])
-    apart = np.where((turn < 1.0) & (shift < 1.0) & (shared < MIN_SHARED), turn + shift, np.inf)
-    nearest = int(apart.argmin())
-    return older[nearest] if np.isfinite(apart[nearest]) else None
+    distance = np.where((turn < 1.0) & (shift < 1.0) & (shared < MIN_SHARED), turn + shift, np.inf)
+    nearest = int(distance.argmin())
+    return older[nearest] if np.isfinite(distance[nearest]) else None
 
 
 def reobserve(slam_map: SlamMap, camera: Camera, keyframe: Keyframe) -> float | None:

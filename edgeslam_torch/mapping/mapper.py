@@ -251,8 +251,8 @@ class Mapper:
         for other in self.map.covisible(newest, 2 * self.config.window):
             if other.id == 0 or newest.id - other.id < 3:
                 continue
-            held = other.anchor[other.anchor >= 0]
-            if len(held) == 0 or np.mean(self.map.anchors.observations[held] >= 4) > self.config.redundancy:
+            observed = other.anchor[other.anchor >= 0]
+            if len(observed) == 0 or np.mean(self.map.anchors.observations[observed] >= 4) > self.config.redundancy:
                 self.map.remove_keyframe(other)
         while len(self.map.keyframes) > self.config.max_keyframes:
             needless = self._most_needless(newest)
@@ -274,5 +274,5 @@ class Mapper:
 
     def _lost_without(self, keyframe: Keyframe) -> float:
         """Share of a keyframe's anchors that only one other keyframe sees, or none: they would go with it."""
-        held = keyframe.anchor[keyframe.anchor >= 0]
-        return float(np.mean(self.map.anchors.observations[held] <= 2)) if len(held) else 0.0
+        observed = keyframe.anchor[keyframe.anchor >= 0]
+        return float(np.mean(self.map.anchors.observations[observed] <= 2)) if len(observed) else 0.0

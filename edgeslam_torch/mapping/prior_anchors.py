@@ -126,8 +126,8 @@ def drop_needless_priors(slam_map: SlamMap, keyframe: Keyframe, min_parallax_rad
     ids = ids[anchors.from_depth[ids]]
     a, b = anchors.p_w[ids] - anchors.origin[ids], anchors.p_w[ids] - keyframe.centre_w
     cosine = (a * b).sum(1) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-12)
-    told = ids[(cosine < np.cos(min_parallax_rad)) & (anchors.observations[ids] >= 2)]
-    anchors.from_depth[told] = False
+    triangulated = ids[(cosine < np.cos(min_parallax_rad)) & (anchors.observations[ids] >= 2)]
+    anchors.from_depth[triangulated] = False
 
 
 def depth_slack_px(anchors: Anchors, ids: IntArray, T_c_w: FloatArray, camera: Camera) -> FloatArray | None:

@@ -312,9 +312,9 @@ class Bootstrap:
 
     def _poses_between(self, frames: set[int]) -> dict[int, FloatArray]:
         """Poses of intermediate frames against the reference keyframe's anchors, by frame index."""
-        held = self.reference.keypoints_with_anchor()
+        observed = self.reference.keypoints_with_anchor()
         points = np.full((len(self.reference.anchor), 3), np.nan)
-        points[held] = self.map.anchors.p_w[self.reference.anchor[held]]
+        points[observed] = self.map.anchors.p_w[self.reference.anchor[observed]]
         views = [v for v in self.views[:-1] if v.frame_index in frames]
         poses, _ = poses_of_witnesses(views, points, self.tracker.camera)
         return {v.frame_index: T for v, T in zip(views, poses, strict=True)}

@@ -217,11 +217,11 @@ class FlowTracker:
         if self._chosen.template is template and self._chosen.revision == self.map.revision:
             return self._chosen.keypoint
         anchors = self.map.anchors
-        held = np.flatnonzero(template.anchor >= 0)
-        held = held[anchors.alive[template.anchor[held]]]
-        seen_by = anchors.observations[template.anchor[held]].astype(np.float64)
-        some = spread(template.uv[held], seen_by, self.camera.width, self.camera.height, self.config.points)
-        self._chosen = _Chosen(template, self.map.revision, held[some])
+        observed = np.flatnonzero(template.anchor >= 0)
+        observed = observed[anchors.alive[template.anchor[observed]]]
+        seen_by = anchors.observations[template.anchor[observed]].astype(np.float64)
+        some = spread(template.uv[observed], seen_by, self.camera.width, self.camera.height, self.config.points)
+        self._chosen = _Chosen(template, self.map.revision, observed[some])
         return self._chosen.keypoint
 
     def _expected(self, T_c_w: FloatArray, anchor: IntArray) -> FloatArray:

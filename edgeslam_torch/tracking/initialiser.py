@@ -162,7 +162,7 @@ def consensus(
     between average the detector's noise, and the covariance shows whether that suffices.
 
     Args:
-        reference: First keyframe; its pose is held.
+        reference: First keyframe; its pose is fixed.
         two_view: From `two_view_map`.
         view: Current frame.
         views: Frames between, in order.

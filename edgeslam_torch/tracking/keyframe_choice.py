@@ -53,8 +53,8 @@ def due_by_flow(followed: Followed, parallax_rad: float, since_keyframe_s: float
 def few_matches(track: Track, reference: Keyframe, slam_map: SlamMap, config: MappingConfig) -> bool:
     """Whether too few of the reference keyframe's anchors are matched."""
     # Anchors of only two keyframes are unstable; overlap is measured on the others.
-    held = reference.anchor[reference.anchor >= 0]
-    established = int((slam_map.anchors.observations[held] >= min(3, len(slam_map.keyframes))).sum())
+    observed = reference.anchor[reference.anchor >= 0]
+    established = int((slam_map.anchors.observations[observed] >= min(3, len(slam_map.keyframes))).sum())
     return track.inliers < config.keyframe_overlap * established
 
 
@@ -118,13 +118,13 @@ def _seen_by(
     anchors, centre = slam_map.anchors, se3.inverse(T_c_w)[:3, 3]
     seen = np.zeros(len(anchors.alive), dtype=bool)
     for keyframe in keyframes:
-        held = keyframe.anchor[keyframe.anchor >= 0]
-        held = held[~anchors.from_depth[held]]
-        ray, other = anchors.p_w[held] - centre, anchors.p_w[held] - keyframe.centre_w
+        observed = keyframe.anchor[keyframe.anchor >= 0]
+        observed = observed[~anchors.from_depth[observed]]
+        ray, other = anchors.p_w[observed] - centre, anchors.p_w[observed] - keyframe.centre_w
         distance, far = (np.maximum(np.sqrt(np.einsum("ij,ij->i", r, r)), 1e-12) for r in (ray, other))
-        alike = np.abs(np.log(distance / far)) <= levels * np.log(slam_map.scale_factor)
+        similar = np.abs(np.log(distance / far)) <= levels * np.log(slam_map.scale_factor)
         cosine = np.einsum("ij,ij->i", ray, other) / (distance * far)
-        seen[held[alike & (cosine >= np.cos(max_rad))]] = True
+        seen[observed[similar & (cosine >= np.cos(max_rad))]] = True
     return seen
 
 

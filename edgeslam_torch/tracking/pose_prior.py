@@ -125,7 +125,7 @@ class SensorPrior:
 
     def is_outlier(self, T_c_w: FloatArray) -> bool:
         """Whether a pose ``(4, 4)`` contradicts either."""
-        return any(told is not None and told.is_outlier(T_c_w) for told in (self.attitude, self.place))
+        return any(sensor is not None and sensor.is_outlier(T_c_w) for sensor in (self.attitude, self.place))
 
     def applied_to(self, T_c_w: FloatArray) -> FloatArray:
         """A pose ``(4, 4)`` with the sensors' rotation and position."""

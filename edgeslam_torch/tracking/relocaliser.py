@@ -215,14 +215,14 @@ def candidates(tracker: Tracker, T_predicted: FloatArray, count: int, attempt: i
 
 def match_keyframe(tracker: Tracker, view: View, keyframe: Keyframe) -> Track | None:
     """Pose of a frame from one similar keyframe, refined on the local map."""
-    held = keyframe.keypoints_with_anchor()
-    if len(held) < MIN_MATCHES:
+    observed = keyframe.keypoints_with_anchor()
+    if len(observed) < MIN_MATCHES:
         return None
     config, camera, anchors = tracker.config, tracker.camera, tracker.map.anchors
-    matches = match_all(keyframe.words[held], view.words, config.max_hamming, config.ratio)
+    matches = match_all(keyframe.words[observed], view.words, config.max_hamming, config.ratio)
     if len(matches) < MIN_MATCHES:
         return None
-    ids = keyframe.anchor[held[matches.query]]
+    ids = keyframe.anchor[observed[matches.query]]
     uv = view.features.uv[matches.train].astype(np.float64)
     ok, rvec, tvec, inliers = cv2.solvePnPRansac(
         anchors.p_w[ids], uv, camera.K, None, iterationsCount=100, reprojectionError=4.0, flags=cv2.SOLVEPNP_EPNP

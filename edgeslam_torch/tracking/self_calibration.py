@@ -230,8 +230,8 @@ def _map_problem(camera: Camera, keyframes: Sequence[Keyframe], p_w: FloatArray)
     """Keyframes, and the anchors that most of them see; None if they are few or did not move."""
     if len(keyframes) < _MIN_REFINED:
         return None
-    held = [keyframe.keypoints_with_anchor() for keyframe in keyframes]
-    anchor = np.concatenate([keyframe.anchor[at] for keyframe, at in zip(keyframes, held, strict=True)])
+    observed = [keyframe.keypoints_with_anchor() for keyframe in keyframes]
+    anchor = np.concatenate([keyframe.anchor[at] for keyframe, at in zip(keyframes, observed, strict=True)])
     ids, seen = np.unique(anchor, return_counts=True)
     chosen = np.sort(ids[np.argsort(-seen, kind="stable")[:_REFINED_ANCHORS]][: np.count_nonzero(seen >= 3)])
     T_c_w = np.stack([keyframe.T_c_w for keyframe in keyframes])
@@ -241,8 +241,8 @@ def _map_problem(camera: Camera, keyframes: Sequence[Keyframe], p_w: FloatArray)
     if len(chosen) < _MIN_MATCHES or distance[far] == 0.0:
         return None
     kept = np.isin(anchor, chosen)
-    uv = np.concatenate([keyframe.features.uv[at] for keyframe, at in zip(keyframes, held, strict=True)])
-    pose = np.repeat(np.arange(len(keyframes)), [len(at) for at in held])
+    uv = np.concatenate([keyframe.features.uv[at] for keyframe, at in zip(keyframes, observed, strict=True)])
+    pose = np.repeat(np.arange(len(keyframes)), [len(at) for at in observed])
     return WindowProblem(
         T_c_w=T_c_w,
         pose_fixed=np.arange(len(keyframes)) < 1,
