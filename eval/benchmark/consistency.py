@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from edgeslam_torch.eval.benchmark.pose_now import Asked, Errors, Truth, judge, told
+from edgeslam_torch.eval.benchmark.pose_now import Errors, Request, Truth, judge, simulated_telemetry
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.output_frame import OutputFrame
@@ -65,11 +65,11 @@ def see(truth: Truth, seed: int) -> Seen:
     return Seen(truth.stamps_s, T, unit)
 
 
-def told_with_errors(truth: Truth, config: FusionConfig, seed: int, delay_s: float, truncated: bool) -> Telemetry:
+def telemetry_with_errors(truth: Truth, config: FusionConfig, seed: int, delay_s: float, truncated: bool) -> Telemetry:
     """State messages of a drone whose velocities and heights have a scale error each."""
     rng = np.random.default_rng([seed, 2])
     velocity, height = (
-        told(_stretched(truth, math.exp(sigma * rng.standard_normal())), delay_s, seed, truncated)
+        simulated_telemetry(_stretched(truth, math.exp(sigma * rng.standard_normal())), delay_s, seed, truncated)
         for sigma in (config.systematic_log, config.height_systematic_log)
     )
     return [
@@ -83,7 +83,7 @@ def _stretched(truth: Truth, factor: float) -> Truth:
     return Truth(truth.stamps_s, T_w_c)
 
 
-def ask(fusion: MotionFusion, seen: Seen, telemetry: Sequence[TelemetrySample]) -> list[Asked]:
+def ask(fusion: MotionFusion, seen: Seen, telemetry: Sequence[TelemetrySample]) -> list[Request]:
     """The present pose a few times a second, in metres of the true scale."""
     published, answers, sent = OutputFrame(seen.metres_per_unit), [], 0
     for i, (stamp, T) in enumerate(zip(seen.stamps_s.tolist(), seen.T_m_c, strict=True)):
@@ -95,7 +95,7 @@ def ask(fusion: MotionFusion, seen: Seen, telemetry: Sequence[TelemetrySample]) 
         fusion.add_visual(stamp, T, JITTER_M / seen.metres_per_unit, JITTER_RAD)
         now = Present(fusion.snapshot(), published, True).pose_at(stamp) if i % _EVERY == 0 else None
         if now is not None:
-            answers.append(Asked(now, published.pose(T)))
+            answers.append(Request(now, published.pose(T)))
     return answers
 
 
@@ -130,7 +130,7 @@ def consistency(config: FusionConfig, seeds: int, *, delay_s: float, speed_m_s: 
         plan = FlightPlan(speed_m_s=speed_m_s)
         flight = course.pilot(rng, course.world(rng), round(_SECONDS * RATE_HZ), rate_hz=RATE_HZ, plan=plan)
         truth = Truth(flight.stamps_s, flight.T_w_c)
-        telemetry, seen = told_with_errors(truth, config, seed, delay_s, truncated), see(truth, seed)
+        telemetry, seen = telemetry_with_errors(truth, config, seed, delay_s, truncated), see(truth, seed)
         fusion = MotionFusion(config, flight.T_b_c)
         errors = judge(ask(fusion, seen, telemetry), truth, delay_s)
         scale = fusion.scale()

@@ -34,7 +34,7 @@ _LEAST_ANSWERS = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class Request:
     """One answer of `pose_now`."""
 
     now: PoseNow
@@ -55,23 +55,23 @@ class Errors:
     velocity_m_s: list[float] = field(default_factory=list)
     nees: list[float] = field(default_factory=list)
     """Of position and rotation since that frame; chi-square with 6 degrees when the covariance is true."""
-    asked: int = 0
+    requests: int = 0
     """Number of requests, with and without the filter."""
 
     def add(self, other: "Errors") -> None:
         """Those of another flight."""
         for name in ("absolute_m", "since_seen_m", "late_m", "velocity_m_s", "nees"):
             getattr(self, name).extend(getattr(other, name))
-        self.asked += other.asked
+        self.requests += other.requests
 
     def line(self, name: str) -> str:
         """For the terminal."""
         if not self.absolute_m:
-            return f"{name}: the filter never gave the pose ({self.asked} requests)"
+            return f"{name}: the filter never gave the pose ({self.requests} requests)"
         return (
             f"{name}: pose {_spread(self.absolute_m)}; motion since the last frame {_spread(self.since_seen_m)}, "
             f"uncompensated {_spread(self.late_m)}; velocity {_spread(self.velocity_m_s)} a second; "
-            f"mean NEES {np.mean(self.nees):.1f} of 6; {len(self.absolute_m)} of {self.asked} by the filter"
+            f"mean NEES {np.mean(self.nees):.1f} of 6; {len(self.absolute_m)} of {self.requests} by the filter"
         )
 
 
@@ -101,7 +101,7 @@ class Truth:
         return T
 
 
-def ask(recording: Recording, telemetry: Sequence[TelemetrySample], config: SlamConfig) -> list[Asked]:
+def ask(recording: Recording, telemetry: Sequence[TelemetrySample], config: SlamConfig) -> list[Request]:
     """Run a recording and ask for the present pose after every frame."""
     slam = EdgeSlam(recording.camera, config)
     answers, published, sent = [], {}, 0
@@ -114,16 +114,16 @@ def ask(recording: Recording, telemetry: Sequence[TelemetrySample], config: Slam
         published[frame.stamp_s] = output.T_w_c
         now = slam.pose_now(frame.stamp_s)
         if now is not None and now.seen_s in published:
-            answers.append(Asked(now, published[now.seen_s]))
+            answers.append(Request(now, published[now.seen_s]))
     return answers
 
 
-def judge(answers: Sequence[Asked], truth: Truth, delay_s: float) -> Errors:
+def judge(answers: Sequence[Request], truth: Truth, delay_s: float) -> Errors:
     """Compare metric answers of the filter with the truth at the moment that they speak of.
 
     Each revision of the published units is aligned by itself: it is an event, and poses across it do not compare.
     """
-    errors = Errors(asked=len(answers))
+    errors = Errors(requests=len(answers))
     for revision in {a.now.revision for a in answers}:
         used = [a for a in answers if a.now.metric and a.now.source == "filter" and a.now.revision == revision]
         used = [a for a in used if a.now.stamp_s + delay_s + _DIFFERENCE_S <= truth.stamps_s[-1]]
@@ -136,19 +136,19 @@ def judge(answers: Sequence[Asked], truth: Truth, delay_s: float) -> Errors:
     return errors
 
 
-def _judge_one(errors: Errors, answer: Asked, truth: Truth, at_s: float, alignment: Alignment) -> None:
+def _judge_one(errors: Errors, answer: Request, truth: Truth, at_s: float, alignment: Alignment) -> None:
     now, T_w_seen = answer.now, answer.T_w_seen
     T_true = truth.at(at_s)
-    told = se3.inverse(T_w_seen) @ now.T_w_c
+    relative = se3.inverse(T_w_seen) @ now.T_w_c
     true = se3.inverse(truth.at(now.seen_s)) @ T_true
     errors.absolute_m.append(float(np.linalg.norm(alignment.points(now.T_w_c[None, :3, 3])[0] - T_true[:3, 3])))
-    errors.since_seen_m.append(float(np.linalg.norm(told[:3, 3] - true[:3, 3])))
+    errors.since_seen_m.append(float(np.linalg.norm(relative[:3, 3] - true[:3, 3])))
     errors.late_m.append(float(np.linalg.norm(true[:3, 3])))
     step = truth.at(at_s + _DIFFERENCE_S)[:3, 3] - truth.at(at_s - _DIFFERENCE_S)[:3, 3]
     velocity = truth.at(now.seen_s)[:3, :3].T @ step / (2.0 * _DIFFERENCE_S)
     errors.velocity_m_s.append(float(np.linalg.norm(T_w_seen[:3, :3].T @ now.velocity_w - velocity)))
-    turned = Rotation.from_matrix(told[:3, :3] @ true[:3, :3].T).as_rotvec()
-    error = np.concatenate([T_w_seen[:3, :3] @ (told[:3, 3] - true[:3, 3]), T_w_seen[:3, :3] @ turned])
+    turned = Rotation.from_matrix(relative[:3, :3] @ true[:3, :3].T).as_rotvec()
+    error = np.concatenate([T_w_seen[:3, :3] @ (relative[:3, 3] - true[:3, 3]), T_w_seen[:3, :3] @ turned])
     errors.nees.append(float(error @ np.linalg.solve(now.covariance[:6, :6], error)))
 
 
@@ -164,7 +164,7 @@ def record(folder: Path, course: str, seed: int, speed_m_s: float, seconds: floa
     return target
 
 
-def told(truth: Truth, delay_s: float, seed: int, truncated: bool) -> list[TelemetrySample]:
+def simulated_telemetry(truth: Truth, delay_s: float, seed: int, truncated: bool) -> list[TelemetrySample]:
     """A Tello's state messages along a flight."""
     faults = TelemetryFaults(video_delay_s=delay_s)
     rng = np.random.default_rng(seed)
@@ -204,7 +204,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for seed in range(args.seeds):
             folder = record(args.folder, course, seed, args.speed, args.seconds)
             truth = Truth.of(folder)
-            telemetry = told(truth, args.delay, seed, args.truncated)
+            telemetry = simulated_telemetry(truth, args.delay, seed, args.truncated)
             for name, settings in variants.items():
                 recording = open_source(folder)
                 assert isinstance(recording, Recording)

@@ -12,7 +12,7 @@ from edgeslam_torch.types import FloatArray
 _FEW = 10
 """Number of poses too small to infer the length of a recording."""
 
-_ALIKE = 200.0
+_MAX_RATIO = 200.0
 """Two files of one recording last as long as each other within this factor; units differ by 1000."""
 
 _UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
@@ -66,16 +66,18 @@ def _unit_factor(truth_s: FloatArray, estimate_s: FloatArray) -> tuple[float, st
     span_t, span_e = truth_s[-1] - truth_s[0], estimate_s[-1] - estimate_s[0]
     ratio = span_e / span_t if span_t > 0 and span_e > 0 else 1.0
     if overlap_s(truth_s, estimate_s) >= 0:
-        few = min(len(truth_s), len(estimate_s)) < _FEW and 1 / _ALIKE < _gap(estimate_s) / _gap(truth_s) < _ALIKE
-        if 1 / _ALIKE < ratio < _ALIKE or few or min(truth_s[0], estimate_s[0]) > SINCE_1970_S:
+        few = (
+            min(len(truth_s), len(estimate_s)) < _FEW and 1 / _MAX_RATIO < _gap(estimate_s) / _gap(truth_s) < _MAX_RATIO
+        )
+        if 1 / _MAX_RATIO < ratio < _MAX_RATIO or few or min(truth_s[0], estimate_s[0]) > SINCE_1970_S:
             return 1.0, ""
     candidates = {f: name for name, unit in _UNITS.items() for f in (unit, 1.0 / unit)}
     for factor, name in candidates.items():
-        alike = 1 / _ALIKE < ratio * factor < _ALIKE
-        if alike and overlap_s(truth_s, estimate_s * factor) > 0.1 * min(span_t, span_e * factor):
+        similar = 1 / _MAX_RATIO < ratio * factor < _MAX_RATIO
+        if similar and overlap_s(truth_s, estimate_s * factor) > 0.1 * min(span_t, span_e * factor):
             return factor, name
     likeliest = min(candidates, key=lambda factor: abs(np.log(ratio * factor)))
-    if not 1 / _ALIKE < ratio < _ALIKE and 1 / 30 < ratio * likeliest < 30:
+    if not 1 / _MAX_RATIO < ratio < _MAX_RATIO and 1 / 30 < ratio * likeliest < 30:
         return likeliest, candidates[likeliest]
     return 1.0, ""
 

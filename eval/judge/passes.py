@@ -151,11 +151,11 @@ def fly(
     """Run the flight until stopped; returns the system, the passes, and the live poses ``(F, 4, 4)``."""
     slam = EdgeSlam(flight.camera, SlamConfig())
     passes: list[Pass] = []
-    live, cpu_ms, told = [], [], 0
+    live, cpu_ms, used = [], [], 0
     for frame in flight.frames():
-        first, told = told, sum(s.stamp_s <= frame.stamp_s for s in flight.telemetry[told:]) + told
+        first, used = used, sum(s.stamp_s <= frame.stamp_s for s in flight.telemetry[used:]) + used
         begin_s = time.process_time()
-        output = slam.step(frame, flight.telemetry[first:told])
+        output = slam.step(frame, flight.telemetry[first:used])
         cpu_ms.append(1e3 * (time.process_time() - begin_s))
         live.append((output.T_w_c, output.status.supported, output.keyframe))
         if len(live) % flight.pass_frames == 0:
@@ -215,9 +215,9 @@ def points_a_room(points: FloatArray, estimate: FloatArray, truth: FloatArray) -
 
 def interrupted() -> Callable[[], bool]:
     """Whether an interrupt was requested; the current frame is finished first."""
-    asked: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
-    return lambda: bool(asked)
+    signals: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: signals.append(number))
+    return lambda: bool(signals)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

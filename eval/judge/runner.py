@@ -53,7 +53,7 @@ def judge(
         settings: How.
         out: Folder for the cells' own folders.
         say: Called with one line for every finished cell.
-        commit: State of the code; asked of git when None. A result of another state is not taken.
+        commit: State of the code; read from git when None. A result of another state is not taken.
         start: Starts a cell's process; `start_cell` when None.
 
     Returns:
@@ -119,7 +119,7 @@ def _result(folder: Path, key: str) -> dict[str, Any] | None:
 
 
 def _others(cells: Sequence[Cell], settings: JudgeSettings, out: Path, commit: str) -> list[dict[str, Any]]:
-    """Rows of results in ``out`` of the same code and settings, of cells not asked for now."""
+    """Rows of results in ``out`` of the same code and settings, of cells not requested now."""
     rows = []
     for path in sorted((out / "cells").glob(f"*/{CELL}")):
         try:

@@ -114,7 +114,7 @@ class View:
         depth[inside] = self.depth_m[uv[inside, 1], uv[inside, 0]]
         return np.where(depth > 0, depth, np.nan)
 
-    def knows(self, p_w: FloatArray, centre_w: FloatArray) -> FloatArray:
+    def covers(self, p_w: FloatArray, centre_w: FloatArray) -> FloatArray:
         """Which points ``(N, 3)`` it shows similarly to a view from another position ``(3,)``."""
         p_c = se3.transform(se3.inverse(self.T_w_c), p_w)
         visible = np.abs(self.depths_at(p_c) / np.maximum(p_c[:, 2], 1e-9) - 1.0) <= SAME_DEPTH
@@ -155,7 +155,7 @@ def known_after_s(first: list[View], second: list[tuple[float, View]], begin_s: 
     """Time until a view of the second flight is known; infinite when none is."""
     for stamp_s, view in second:
         p_w = view.grid()
-        if any(earlier.knows(p_w, view.T_w_c[:3, 3]).mean() >= KNOWN_SHARE for earlier in first if len(p_w)):
+        if any(earlier.covers(p_w, view.T_w_c[:3, 3]).mean() >= KNOWN_SHARE for earlier in first if len(p_w)):
             return max(0.0, stamp_s - begin_s)
     return math.inf
 

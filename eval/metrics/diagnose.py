@@ -194,8 +194,8 @@ def _likeliest(suspects: Sequence[_Suspect], limit: float) -> str | None:
     best = min(suspects, key=lambda suspect: suspect.error)
     if not best.error < limit:
         return None
-    alike = [s for s in suspects if s.mistake == best.mistake and s.error < 2.0 * best.error + 0.1 * limit]
-    return (best if len(alike) == 1 else replace(best, whose=_EITHER)).text
+    similar = [s for s in suspects if s.mistake == best.mistake and s.error < 2.0 * best.error + 0.1 * limit]
+    return (best if len(similar) == 1 else replace(best, whose=_EITHER)).text
 
 
 def _with(trajectory: Trajectory, T_w_c: FloatArray) -> Trajectory:

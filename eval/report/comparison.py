@@ -249,9 +249,9 @@ def _settings(run: RunFolder) -> dict[str, str]:
 
 def _values(run: RunFolder) -> dict[str, str]:
     """``summary.json`` without what the figures contain."""
-    told = ("source: ", "fps", "cpu", "peak", "stage", "step", "warnings", "pieces", "map: ", "losses: ")
+    shown = ("source: ", "fps", "cpu", "peak", "stage", "step", "warnings", "pieces", "map: ", "losses: ")
     rows = words.flat_rows(run.summary)
-    return {name: value for name, value in rows if not name.startswith(told)}
+    return {name: value for name, value in rows if not name.startswith(shown)}
 
 
 def _different(heading: str, a: dict[str, str], b: dict[str, str]) -> str:

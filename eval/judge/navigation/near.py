@@ -47,14 +47,14 @@ def near_counts(view: View, true_m: FloatArray) -> NearCounts:
         true_m: ``(H, W)`` z-depth [m].
     """
     known = np.isfinite(view.depth_m) & (view.depth_m > 0)
-    told = np.where(known, view.depth_m, np.inf)
-    sure = np.where(known, told * np.exp(-_SIGMAS * view.sigma_log), np.inf)
+    measured = np.where(known, view.depth_m, np.inf)
+    lower = np.where(known, measured * np.exp(-_SIGMAS * view.sigma_log), np.inf)
     true = np.where(np.isfinite(true_m) & (true_m > 0), true_m, np.inf)
     angle = np.arctan((np.arange(true.shape[1]) - view.K[0, 2]) / view.K[0, 0])
     sector = np.floor((angle - angle[0]) / SECTOR_RAD).astype(int)
     counts = NearCounts()
     for k in range(int(sector[-1]) + 1):
-        nearest, expected, at_least = (float(d[:, sector == k].min()) for d in (true, told, sure))
+        nearest, expected, at_least = (float(d[:, sector == k].min()) for d in (true, measured, lower))
         if NEAR_M[0] <= nearest <= NEAR_M[1]:
             far = [math.isfinite(d) and d - nearest > TOO_FAR_M for d in (expected, at_least)]
             counts += NearCounts(1, int(far[0]), int(far[1]))

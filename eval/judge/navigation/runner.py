@@ -79,7 +79,7 @@ def _earlier(file: Path, case: Case) -> Flown | None:
 
 
 def _line(flown: Flown) -> str:
-    told = f"; {', '.join(flown.dangers)}" if flown.dangers else ""
+    dangers = f"; {', '.join(flown.dangers)}" if flown.dangers else ""
     there, found, right = flown.exits
     return (
         f"{flown.case.behaviour} {flown.case.world} {flown.case.seed} {flown.case.fault} by {flown.case.perception}: "
@@ -87,5 +87,5 @@ def _line(flown: Flown) -> str:
         f"(oracle {flown.oracle_s:.1f}), {flown.distance_m:.2f} m from the goal, "
         f"{flown.home_m:.2f} m from the take-off, {flown.contacts} contacts, "
         f"exits: {right} of {there} found and {found - right} wrong, "
-        f"clearance {flown.clearance_min_m:.2f} m{told}"
+        f"clearance {flown.clearance_min_m:.2f} m{dangers}"
     )

@@ -162,8 +162,8 @@ def spoilt(
             values = np.array([getattr(s, name) for s in samples])
             where = slice(None) if axis is None else (slice(None), axis)
             values[where] = change(values[where])
-            told = values.tolist() if values.ndim == 1 else list(values)
-            samples = [replace(s, **{name: value}) for s, value in zip(samples, told, strict=True)]
+            column = values.tolist() if values.ndim == 1 else list(values)
+            samples = [replace(s, **{name: value}) for s, value in zip(samples, column, strict=True)]
         return samples
 
     return make

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.eval.benchmark.consistency import see
-from edgeslam_torch.eval.benchmark.pose_now import Asked, Truth, judge
+from edgeslam_torch.eval.benchmark.pose_now import Request, Truth, judge
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import PoseNow
 
@@ -27,7 +27,7 @@ def answers(truth, T_published_world, late_s=0.0, **fields):
         velocity = T_published_world[:3, :3] @ step[:3, 3] / 0.1
         told = {"source": "filter", "metric": True, "revision": 0, **fields}
         pose = PoseNow(float(stamp), now, velocity, np.eye(9) * 0.01**2, seen_s=float(stamp), **told)
-        out.append(Asked(pose, T_published_world @ truth.at(stamp)))
+        out.append(Request(pose, T_published_world @ truth.at(stamp)))
     return out
 
 
@@ -49,7 +49,7 @@ def test_late_answers_are_off_by_the_way_of_that_time(truth):
 @pytest.mark.parametrize("fields", [{"source": "visual"}, {"metric": False}])
 def test_only_metric_answers_of_the_filter_count(truth, fields):
     errors = judge(answers(truth, np.eye(4), **fields), truth, DELAY_S)
-    assert (errors.absolute_m, errors.asked) == ([], len(truth.stamps_s) - 12)
+    assert (errors.absolute_m, errors.requests) == ([], len(truth.stamps_s) - 12)
     assert "never" in errors.line("flight")
 
 
