@@ -91,18 +91,18 @@ class UpDirections:
 
 @dataclass(frozen=True, slots=True)
 class _Rows:
-    """Linear measurements of positions in world axes [m]: ``D p = told``."""
+    """Linear measurements of positions in world axes [m]: ``D p = measured``."""
 
     D: FloatArray
     """``(M, K, 3)`` without the scale."""
-    told: FloatArray
+    measured: FloatArray
     """``(M,)``"""
     white: FloatArray
     """``(M,)`` variances of independent errors."""
     slow: FloatArray
     """``(M, M)`` covariance of correlated errors."""
     common: FloatArray
-    """``(M, C)`` change of ``told`` per standard deviation of each common nuisance parameter."""
+    """``(M, C)`` change of ``measured`` per standard deviation of each common nuisance parameter."""
     group: IntArray
     """``(M,)`` groups of rows that form one measurement."""
     way: FloatArray
@@ -210,13 +210,13 @@ class TelemetryModel:
         for axis in range(3):
             D[np.arange(N), axis, use + 1, axis] = 1.0
             D[np.arange(N), axis, use, axis] = -1.0
-        told = self.track.readings
-        share = _shares(told.stamp_s, start, end)  # (N, S)
+        measured = self.track.readings
+        share = _shares(measured.stamp_s, start, end)  # (N, S)
         heard = np.flatnonzero(share.any(axis=0))
         share = share[:, heard]
         R_w = self.track.axes()[heard]
-        raw = np.einsum("swa,sw->sa", R_w, told.velocity[heard])
-        U = _runs(share, told.stamp_s[heard], raw, R_w, step, truncates)
+        raw = np.einsum("swa,sw->sa", R_w, measured.velocity[heard])
+        U = _runs(share, measured.stamp_s[heard], raw, R_w, step, truncates)
         bias = BIAS_M_S**2 * np.exp(-np.abs(start[:, None] - start[None]) / BIAS_MEMORY_S) * np.outer(L, L)
         slow = U @ U.T + np.einsum("ij,ab->iajb", bias, np.eye(3)).reshape(3 * N, 3 * N)
         half = 0.5 * step * math.sqrt(truncates * (1.0 - truncates))
@@ -227,7 +227,7 @@ class TelemetryModel:
                 np.diff(per_scale_w, axis=0)[use][..., None],
                 TILT_RAD * hat(d),
                 (delay * 10.0 * np.diff(speed, axis=0)[use])[..., None],
-                (half * np.einsum("ns,sa->na", share, told.sign[heard]))[..., None],
+                (half * np.einsum("ns,sa->na", share, measured.sign[heard]))[..., None],
             ],
             axis=-1,
         )
@@ -286,8 +286,8 @@ class TelemetryModel:
 
     def _gaussian(self, rows: _Rows, p_m: FloatArray) -> PositionGaussian:
         """Marginalise, reweight outliers, and rotate to map axes."""
-        D = np.einsum("mkw,wv->mkv", rows.D, self.R_w_m).reshape(len(rows.told), -1) * self.scale
-        residual = D @ p_m.ravel() - rows.told
+        D = np.einsum("mkw,wv->mkv", rows.D, self.R_w_m).reshape(len(rows.measured), -1) * self.scale
+        residual = D @ p_m.ravel() - rows.measured
         slow = rows.slow + rows.common @ rows.common.T
         weight = np.ones(len(residual))
         for _ in range(3):
@@ -300,11 +300,11 @@ class TelemetryModel:
             tukey = tukey_weight(z, spread)
             weight = np.maximum(tukey, _LEAST_WEIGHT)[rows.group]
         factor = cho_factor(slow + np.diag(rows.white / weight), lower=True)
-        whitened = cho_solve(factor, np.column_stack([D, rows.told]))
+        whitened = cho_solve(factor, np.column_stack([D, rows.measured]))
         A = D.T @ whitened[:, :-1]
         refused = int(np.count_nonzero(tukey <= _LEAST_WEIGHT))
         return PositionGaussian(
-            0.5 * (A + A.T), D.T @ whitened[:, -1], float(rows.told @ whitened[:, -1]), len(tukey), refused
+            0.5 * (A + A.T), D.T @ whitened[:, -1], float(rows.measured @ whitened[:, -1]), len(tukey), refused
         )
 
 
@@ -318,13 +318,13 @@ def _still(rows: _Rows | None, at_s: FloatArray) -> _Rows | None:
     if rows is None:
         return None
     lasted_s = rows.D.sum(2) @ at_s
-    keep = np.flatnonzero(np.abs(rows.told) < _STILL_M_S * lasted_s)
+    keep = np.flatnonzero(np.abs(rows.measured) < _STILL_M_S * lasted_s)
     if len(keep) == 0:
         return None
     group = np.unique(rows.group[keep], return_inverse=True)[1]
     return _Rows(
         rows.D[keep],
-        rows.told[keep],
+        rows.measured[keep],
         rows.white[keep],
         rows.slow[np.ix_(keep, keep)],
         rows.common[keep],
@@ -336,17 +336,17 @@ def _still(rows: _Rows | None, at_s: FloatArray) -> _Rows | None:
 def _stacked(parts: list[_Rows]) -> _Rows | None:
     if not parts:
         return None
-    size = sum(len(part.told) for part in parts)
+    size = sum(len(part.measured) for part in parts)
     slow, at, groups = np.zeros((size, size)), 0, 0
     group = []
     for part in parts:
-        n = len(part.told)
+        n = len(part.measured)
         slow[at : at + n, at : at + n] = part.slow
         group.append(part.group + groups)
         at, groups = at + n, groups + int(part.group[-1]) + 1
     return _Rows(
         np.concatenate([p.D for p in parts]),
-        np.concatenate([p.told for p in parts]),
+        np.concatenate([p.measured for p in parts]),
         np.concatenate([p.white for p in parts]),
         slow,
         np.concatenate([p.common for p in parts]),

@@ -41,8 +41,8 @@ class Headings:
 def headings(model: TelemetryModel, stamps_s: FloatArray) -> Headings | None:
     """Headings of frames at increasing ``stamps_s`` ``(K,)``; None for fewer than two, or without metric scale."""
     at_s = stamps_s - model.delay_s
-    told = model.knows_metres and model.attitude and model.track.has_attitude
-    frame = np.flatnonzero(model.track.covered(at_s, at_s)) if told else np.zeros(0, dtype=np.int64)
+    measured = model.knows_metres and model.attitude and model.track.has_attitude
+    frame = np.flatnonzero(model.track.covered(at_s, at_s)) if measured else np.zeros(0, dtype=np.int64)
     if len(frame) < 2:
         return None
     t = at_s[frame]

@@ -122,7 +122,7 @@ class MotionFusion:
         if self._is_due(stamp_s) or (stamp_s - self._fitted_s >= _FIRST_FIT_S and self.orientation.has_diverged()):
             self._remember_refined(stamp_s, self.config.window_s)
             self._refit()
-        elif self.metres.told is not None and stamp_s - max(self._fitted_s, self._followed_s) >= _REFIT_S:
+        elif self.metres.sensor_scale is not None and stamp_s - max(self._fitted_s, self._followed_s) >= _REFIT_S:
             self._follow_map(stamp_s)
         if self._trust.velocity and self._trust.motion:
             self._filter.see(visual, Metric(self.scale(), self.flight.delay.delay))
@@ -223,7 +223,7 @@ class MotionFusion:
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
         """As `Orientation.vertical`; None if the map did not begin upright, or has a metric scale: attitude in whole
         degrees is worse than a map with parallax."""
-        asked = self.metres.told is None and self.orientation.began_upright
+        asked = self.metres.sensor_scale is None and self.orientation.began_upright
         return self.orientation.vertical(stamp_s) if asked else None
 
     def attitude_and_position(self, stamp_s: float) -> tuple[tuple[FloatArray, float] | None, Reckoned | None]:
@@ -233,8 +233,8 @@ class MotionFusion:
     def reckoned(self, stamp_s: float) -> Reckoned | None:
         """Position of a frame's camera by dead reckoning; None without validated velocities or without a metric scale
         that rests on them: heights alone may give a scale that is wrong by several times."""
-        told = self.metres.told
-        if told is None or "telemetry" not in told.source:
+        scale = self.metres.sensor_scale
+        if scale is None or "telemetry" not in scale.source:
             return None
         model, recent = self._model(), self._memory.recent(stamp_s - RECKONED_S)
         if model is None or recent is None or not (model.velocity and math.isfinite(model.delay_sigma_s)):
@@ -257,8 +257,8 @@ class MotionFusion:
             return None
         view = self._filter.view(stamp_s) if stamp_s > last.stamp_s else None
         if view is not None:
-            told = by_filter(view, self.scale(), self.flight.delay_sigma_s)
-            return with_velocity(told, last, previous, self.scale())
+            predicted = by_filter(view, self.scale(), self.flight.delay_sigma_s)
+            return with_velocity(predicted, last, previous, self.scale())
         return self._predict_unfiltered(last, previous, stamp_s)
 
     def republished(self, published: OutputFrame, centre_map: FloatArray, keep_scale: bool) -> OutputFrame:
@@ -318,8 +318,8 @@ class MotionFusion:
         share = 1.0 if previous is None else float(np.clip((gap - VISUAL_REACH_S) / VISUAL_REACH_S, 0.0, 1.0))
         if share == 0.0 or gap <= 0.0 or not self._trust.motion:
             return visual
-        told = self._propagation().on(last, stamp_s)
-        return visual if told is None else between(visual, told, share)
+        propagated = self._propagation().on(last, stamp_s)
+        return visual if propagated is None else between(visual, propagated, share)
 
     def _propagation(self) -> TelemetryPropagation:
         sigma = self.config.sigma_velocity_m_s
@@ -356,8 +356,8 @@ class MotionFusion:
 
     def _model(self) -> TelemetryModel | None:
         """The same without a copy of the track, for immediate use."""
-        told, orientation = self.metres.told, self.orientation
-        R_w_m = orientation.R_w_m if told is not None else np.eye(3) if orientation.began_upright else None
+        scale, orientation = self.metres.sensor_scale, self.orientation
+        R_w_m = orientation.R_w_m if scale is not None else np.eye(3) if orientation.began_upright else None
         if R_w_m is None:
             return None
         there = self._track.heights()
@@ -366,17 +366,17 @@ class MotionFusion:
         return TelemetryModel(
             self._track,
             self.config,
-            orientation.given if told is None else orientation.T_b_c,
+            orientation.given if scale is None else orientation.T_b_c,
             R_w_m,
             self.delay_s,
             self.flight.delay_sigma_s,
-            1.0 if told is None else math.exp(told.log_scale),
-            math.inf if told is None else told.sigma,
+            1.0 if scale is None else math.exp(scale.log_scale),
+            math.inf if scale is None else scale.sigma,
             self.metres.velocity_constrains_map(self._trust),
-            heights[0] if told is not None and heights and (odds is None or odds.kept == "height") else None,
+            heights[0] if scale is not None and heights and (odds is None or odds.kept == "height") else None,
             self.metres.fit.truncates,
             self._trust.attitude,
-            standing=told is not None and self.metres.velocity_is_right(self._trust),
+            standing=scale is not None and self.metres.velocity_is_right(self._trust),
         )
 
     # --- estimation ----------------------------------------------------------------------------------------------
@@ -394,7 +394,7 @@ class MotionFusion:
         return self.flight.trust
 
     def _is_due(self, stamp_s: float) -> bool:
-        known = self.metres.told is not None and math.isfinite(self.flight.delay_sigma_s)
+        known = self.metres.sensor_scale is not None and math.isfinite(self.flight.delay_sigma_s)
         first_s = _REFIT_S if known else _FIRST_FIT_S
         pause_s = max(first_s, _REFIT_SHARE * min(self._memory.length_s, self.config.window_s))
         return len(self._track) > 0 and (self.orientation.found is None or stamp_s - self._fitted_s >= pause_s)
@@ -424,7 +424,7 @@ class MotionFusion:
             return TelemetryScale(self.config, T_b_c, present, trust, self.delay_s, turned, previous_scale, flying)
 
         metres.take(scale(self._trust).opinion(), convergence_sigma, self._trust)
-        guesses = flying and metres.told is None
+        guesses = flying and metres.sensor_scale is None
         metres.provisional_scale(
             scale(self._trust.supposing_heights()).opinion() if guesses else None, convergence_sigma
         )

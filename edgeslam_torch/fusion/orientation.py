@@ -67,22 +67,22 @@ class Orientation:
     def fitted(self) -> Turned | None:
         """Fit to all stored poses; the mount is estimated only after the attitude was validated by images."""
         flight = self._flight
-        told = attitudes(flight.memory.sightings(), flight.track, flight.delay_s)
-        if told is None:
+        pairs = attitudes(flight.memory.sightings(), flight.track, flight.delay_s)
+        if pairs is None:
             return None
         R_b_c, sigma_rad = self.given[:3, :3], flight.config.alignment_sigma_rad
         if flight.trust.turns:
-            return mount_by_turns(told.R_m_c, told.R_w_b, told.stamp_s, R_b_c, sigma_rad)
-        return Turned(R_b_c, told.map_to_world(R_b_c), np.full(3, sigma_rad))
+            return mount_by_turns(pairs.R_m_c, pairs.R_w_b, pairs.stamp_s, R_b_c, sigma_rad)
+        return Turned(R_b_c, pairs.map_to_world(R_b_c), np.full(3, sigma_rad))
 
     def has_diverged(self) -> bool:
         """Whether a validated attitude has begun to disagree with the images."""
         flight, found = self._flight, self.found
         asked = found is not None and flight.trust.turns and math.isfinite(flight.delay_sigma_s)
-        told = attitudes(flight.memory.newest(LATELY), flight.track, flight.delay_s) if asked else None
-        if told is None or found is None:
+        pairs = attitudes(flight.memory.newest(LATELY), flight.track, flight.delay_s) if asked else None
+        if pairs is None or found is None:
             return False
-        return float(np.linalg.norm(rotation_vector(told.map_to_world(found.R_b_c) @ found.R_w_m.T))) > MOST_APART_RAD
+        return float(np.linalg.norm(rotation_vector(pairs.map_to_world(found.R_b_c) @ found.R_w_m.T))) > MOST_APART_RAD
 
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
         """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and its maximum error [rad] due to the
@@ -123,10 +123,10 @@ class Orientation:
         if not (flight.trust.turns and math.isfinite(flight.delay_sigma_s)):
             return None
         shown = Sightings(stamps_s, T_w_c, np.zeros(len(stamps_s)))
-        told = attitudes(shown, flight.track, flight.delay_s)
-        if told is None or len(told.stamp_s) < _LEAST_FACING:
+        pairs = attitudes(shown, flight.track, flight.delay_s)
+        if pairs is None or len(pairs.stamp_s) < _LEAST_FACING:
             return None
-        each = told.R_w_b @ self.T_b_c[:3, :3] @ np.swapaxes(told.R_m_c, 1, 2)
+        each = pairs.R_w_b @ self.T_b_c[:3, :3] @ np.swapaxes(pairs.R_m_c, 1, 2)
         R_w_m = mean_rotation(each)
         angle = turn_left(each @ R_w_m.T)
         return R_w_m, math.hypot(flight.config.alignment_sigma_rad, float(np.sqrt(np.mean(angle**2))))

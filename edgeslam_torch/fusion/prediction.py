@@ -57,23 +57,23 @@ def by_filter(view: FilterView, scale: ScaleEstimate, delay_sigma_s: float) -> P
 
 
 def with_velocity(
-    told: PoseEstimate, last: VisualPose, previous: VisualPose | None, scale: ScaleEstimate
+    prior: PoseEstimate, last: VisualPose, previous: VisualPose | None, scale: ScaleEstimate
 ) -> PoseEstimate:
     """The filter's prediction and that of constant velocity, weighted by their variances."""
     if previous is None:
-        return told
-    seen = by_vision(last, previous, told.stamp_s)
-    gap, before = told.stamp_s - last.stamp_s, last.stamp_s - previous.stamp_s
+        return prior
+    seen = by_vision(last, previous, prior.stamp_s)
+    gap, before = prior.stamp_s - last.stamp_s, last.stamp_s - previous.stamp_s
     grown = math.sqrt(1.0 + 2.0 * (gap / before) ** 2)  # jitter of two poses in their difference
     sigma_t = math.hypot(0.5 * _ACCELERATION_M_S2 * gap**2 / scale.value, grown * last.sigma_t)
     sigma_r = math.hypot(0.5 * _ANGULAR_ACCELERATION_RAD_S2 * gap**2, grown * last.sigma_r_rad)
-    share_t, share_r = (b**2 / (a**2 + b**2) for a, b in ((told.sigma_t, sigma_t), (told.sigma_r_rad, sigma_r)))
+    share_t, share_r = (b**2 / (a**2 + b**2) for a, b in ((prior.sigma_t, sigma_t), (prior.sigma_r_rad, sigma_r)))
     T = seen.T_w_c.copy()
-    T[:3, 3] += share_t * (told.T_w_c[:3, 3] - T[:3, 3])
-    apart = rotation_vector(T[:3, :3].T @ told.T_w_c[:3, :3])
+    T[:3, 3] += share_t * (prior.T_w_c[:3, 3] - T[:3, 3])
+    apart = rotation_vector(T[:3, :3].T @ prior.T_w_c[:3, :3])
     T[:3, :3] = T[:3, :3] @ se3.exp(np.concatenate([np.zeros(3), share_r * apart]))[:3, :3]
     return replace(
-        told, T_w_c=T, sigma_t=math.sqrt(share_t) * told.sigma_t, sigma_r_rad=math.sqrt(share_r) * told.sigma_r_rad
+        prior, T_w_c=T, sigma_t=math.sqrt(share_t) * prior.sigma_t, sigma_r_rad=math.sqrt(share_r) * prior.sigma_r_rad
     )
 
 

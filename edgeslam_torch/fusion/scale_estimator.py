@@ -38,8 +38,8 @@ class ScaleEstimator:
         self._depth = DepthRatios(self._depth_bias_log)
         truncates = config.velocity_rounding == "truncate"
         self.fit = TelemetryFit(shortfall_m_s=0.5 * config.velocity_step_m_s if truncates else 0.0)
-        """Details of the fit of `told`."""
-        self.told: LogScale | None = None
+        """Details of the fit of `sensor_scale`."""
+        self.sensor_scale: LogScale | None = None
         """Scale by the drone's own sensors; unchanged without new measurements."""
         self.guess: ScaleEstimate | None = None
         """Scale by a climb before telemetry is validated; None afterwards. Not metric: only a better guess of the
@@ -81,9 +81,9 @@ class ScaleEstimator:
         if found is not None:
             self.fit = found[1]
         if found is not None and found[0].sigma < _BELIEVED:
-            self.told = replace(found[0], sigma=math.hypot(found[0].sigma, convergence_sigma))
+            self.sensor_scale = replace(found[0], sigma=math.hypot(found[0].sigma, convergence_sigma))
         elif not self._still_trusted(trust) or self._of_heights():
-            self.told, self.fit = None, TelemetryFit(shortfall_m_s=self.fit.shortfall_m_s)
+            self.sensor_scale, self.fit = None, TelemetryFit(shortfall_m_s=self.fit.shortfall_m_s)
         # else no new information: hover, pure rotation, or no telemetry
 
     def provisional_scale(self, found: Found | None, convergence_sigma: float) -> None:
@@ -95,12 +95,12 @@ class ScaleEstimator:
 
     def follow(self, log_ratio: float) -> None:
         """Adapt the scale to a map that has grown by ``exp(log_ratio)``."""
-        if self.told is not None:
-            self.told = replace(self.told, log_scale=self.told.log_scale - log_ratio)
+        if self.sensor_scale is not None:
+            self.sensor_scale = replace(self.sensor_scale, log_scale=self.sensor_scale.log_scale - log_ratio)
 
     def _of_heights(self) -> bool:
         """Whether the scale rests on heights alone, which are void once the map's vertical has changed."""
-        return self.told is not None and self.told.source == "height"
+        return self.sensor_scale is not None and self.sensor_scale.source == "height"
 
     def _still_trusted(self, trust: SensorGate) -> bool:
         """Whether all sources of the present scale are still usable."""
@@ -112,14 +112,14 @@ class ScaleEstimator:
 
     def scale(self) -> ScaleEstimate:
         """Metres per map unit with sigma and source; unchanged without new measurements."""
-        rests_on = self._remembered, self.told, self._depth.scale()
+        rests_on = self._remembered, self.sensor_scale, self._depth.scale()
         if rests_on != self._rests_on:  # cached, since it is used several times a frame
             self._rests_on, self._scale = rests_on, fuse(self._settled().used)
         return self._scale
 
     def previous_scale(self) -> float | None:
         """Scale by telemetry alone."""
-        return None if self.told is None else math.exp(self.told.log_scale)
+        return None if self.sensor_scale is None else math.exp(self.sensor_scale.log_scale)
 
     def network_unit(self) -> float | None:
         """Scale by the depth network alone; None before the first comparison."""
@@ -143,8 +143,8 @@ class ScaleEstimator:
 
     def velocity_constrains_map(self, trust: SensorGate) -> bool:
         """Whether velocities may constrain the map: not with an inaccurate scale from heights alone."""
-        told = self.told
-        if told is None or not ("telemetry" in told.source or told.sigma < _SURE):
+        measured = self.sensor_scale
+        if measured is None or not ("telemetry" in measured.source or measured.sigma < _SURE):
             return False
         return self.velocity_is_right(trust)
 
@@ -154,9 +154,9 @@ class ScaleEstimator:
 
     def sources(self) -> tuple[ScaleEstimate, ...]:
         """Scale by each source alone, used or not."""
-        told = [ScaleEstimate(s.value, s.sigma, name) for name, s in self.fit.sources.items()]
-        told += [_estimate(known) for known in (self.network(), self._remembered) if known is not None]
-        return tuple(told)
+        measured = [ScaleEstimate(s.value, s.sigma, name) for name, s in self.fit.sources.items()]
+        measured += [_estimate(known) for known in (self.network(), self._remembered) if known is not None]
+        return tuple(measured)
 
     def contradiction(self) -> str | None:
         """Warning of contradicting sources."""
@@ -164,7 +164,7 @@ class ScaleEstimator:
 
     def warnings(self) -> list[str]:
         """The same, and a warning of the depth network where its metres are needed."""
-        depth = self._depth.scale() if self.told is None else None
+        depth = self._depth.scale() if self.sensor_scale is None else None
         own = (None if depth is None else depth.warning(), self.contradiction())
         return [said for said in own if said is not None]
 
@@ -178,12 +178,12 @@ class ScaleEstimator:
 
     def _settled(self) -> Settled:
         """Estimates that may be averaged."""
-        told, depth = self.told, self._depth.scale()
-        if told is not None:
-            told = replace(told, sigma=math.hypot(told.sigma, _FOCAL_SHARE * self._focal_sigma))
+        measured, depth = self.sensor_scale, self._depth.scale()
+        if measured is not None:
+            measured = replace(measured, sigma=math.hypot(measured.sigma, _FOCAL_SHARE * self._focal_sigma))
         if self._remembered is not None:  # which includes the network's estimate
-            return settled_with_network(told, self._remembered, True)
-        return settled_with_network(told, self.network(), depth is not None and depth.in_domain)
+            return settled_with_network(measured, self._remembered, True)
+        return settled_with_network(measured, self.network(), depth is not None and depth.in_domain)
 
     def _with_focal(self, depth: DepthScale) -> LogScale:
         """Map depth and network depth scale with the focal length: the ratio has its whole uncertainty."""

@@ -188,5 +188,5 @@ def test_velocities_on_which_no_metres_rest_carry_nothing(rng, swinging, replay,
     replay(fusion, motion, motion.in_gauge(rng), simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples())
     last_s = float(motion.stamps_s[-20])
     assert fusion.reckoned(last_s) is not None
-    fusion.metres.told = replace(fusion.metres.told, source=source)
+    fusion.metres.sensor_scale = replace(fusion.metres.sensor_scale, source=source)
     assert (fusion.reckoned(last_s) is None) == (source == "height")

@@ -388,7 +388,7 @@ def test_a_drone_that_only_turns_forgets_the_metres_of_its_climb(swinging, repla
         T_w_b[:, 2, 3] = 0.4 + 0.25 * risen**2 * (3 - 2 * risen)
         motion = replace(swinging(1.0), stamps_s=t, T_w_c=T_w_b @ T_B_C)
         fusion, gauge, _ = fused(np.random.default_rng(0), motion, informed, TelemetryFaults(video_delay_s=0.0))
-        told[turned_rad] = fusion.metres.told
+        told[turned_rad] = fusion.metres.sensor_scale
     assert told[0.0].source == "height" and told[0.0].sigma < 0.13
     assert told[0.0].sigma < told[0.5].sigma < told[1.5].sigma < told[3.0].sigma
     assert told[3.0].sigma > 0.25, "three views away, each of a unit that is .15 another"
@@ -409,7 +409,7 @@ def test_heights_that_hardly_change_tell_no_metres(swinging, replay):
     motion = replace(swinging(1.0), stamps_s=t, T_w_c=T_w_b @ T_B_C)
     for seed in range(3):
         fusion, _, _ = fused(np.random.default_rng(seed), motion, informed, TelemetryFaults(video_delay_s=0.0))
-        assert fusion.metres.told is None
+        assert fusion.metres.sensor_scale is None
 
 
 @pytest.mark.parametrize(("source", "held"), [("height", False), ("telemetry+height", True)])
@@ -419,7 +419,7 @@ def test_metres_by_heights_alone_are_not_held_when_heights_do_not_bear_them_out(
     metres = ScaleEstimator(FusionConfig(), 0.0)
     metres.take((LogScale(0.0, 0.1, source), TelemetryFit()), 0.0, trusting)
     metres.take(found, 0.0, trusting)
-    assert (metres.told is not None) == held
+    assert (metres.sensor_scale is not None) == held
 
 
 def test_velocities_and_heights_that_disagree_widen_sigma(rng, swinging, replay):

@@ -77,7 +77,7 @@ def test_what_is_stated_of_a_flight_on_the_spot_covers_the_truth(grow, metric):
         T_w_c = turning(rng)
         T_m_c = mapped(rng, T_w_c, grow(rng))
         fusion = in_the_end(T_w_c, T_m_c, rng)
-        assert (fusion.metres.told is not None) == metric
+        assert (fusion.metres.sensor_scale is not None) == metric
         assert sigmas_off(fusion, T_m_c, T_w_c) < 2.0
         assert metric or any("too badly" in said for said in fusion.warnings())
 
@@ -89,7 +89,7 @@ def test_velocities_in_another_unit_than_the_heights_are_not_explained_by_trunca
         T_w_c = turning(rng, size_m=0.18)
         T_m_c = mapped(rng, T_w_c, as_it_is(rng))
         half = in_the_end(T_w_c, T_m_c, rng, lambda s: replace(s, velocity_m_s=0.5 * s.velocity_m_s))
-        assert half.metres.told is None
+        assert half.metres.sensor_scale is None
         assert any("contradict each other" in said for said in half.warnings())
 
 
@@ -99,5 +99,5 @@ def test_truncated_velocities_tell_the_scale():
         T_w_c = turning(rng, size_m=0.18)
         T_m_c = mapped(rng, T_w_c, as_it_is(rng))
         fusion = in_the_end(T_w_c, T_m_c, rng, truncated, TelemetryFaults(quantise=False))
-        assert "telemetry" in fusion.metres.told.source
+        assert "telemetry" in fusion.metres.sensor_scale.source
         assert sigmas_off(fusion, T_m_c, T_w_c) < 2.0

@@ -457,7 +457,7 @@ def test_velocities_pull_at_the_map_where_they_go_with_metres_that_are_known(sou
     """A young map's heights may tell a unit several times off at a quarter, and velocities would tear it by that."""
     fusion = MotionFusion(FusionConfig(), T_B_C)
     fusion.orientation.found = Turned(np.eye(3), np.eye(3), np.zeros(3))
-    fusion.metres.told = LogScale(0.0, sigma, source)
+    fusion.metres.sensor_scale = LogScale(0.0, sigma, source)
     fusion.flight.trust.judge(Reading.VELOCITY, Agreement(0.99, 30))
     fusion.flight.trust.at_odds = None if kept == "" else AtOdds(10.0, 1.0, kept)
     assert fusion.telemetry().velocity is speaks
