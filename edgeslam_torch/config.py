@@ -296,6 +296,9 @@ class WindowConfig:
     off, its default."""
     in_flight_edges: int = 300
     """Edge pixels per keyframe there, each associated in two neighbours."""
+    solver: str = "compiled"
+    """What computes residuals and derivatives of windows: ``compiled`` loops, or the ``modules`` of
+    `edgeslam_torch.losses` with automatic differentiation, the same to rounding and many times slower."""
     telemetry: str = "every"
     """Where the drone's displacements, heights and gravity keep the map's scale and level the same all over: in
     ``every`` refinement, in the ``last`` one, or ``off``."""
@@ -312,6 +315,7 @@ class WindowConfig:
             ("angle", ("arms", "cosine", "literal", "off")),
             ("collinearity", ("relative", "literal", "off")),
             ("in_flight", ("off", "few", "always")),
+            ("solver", ("compiled", "modules")),
             ("telemetry", ("every", "last", "off")),
         ):
             if getattr(self, name) not in allowed:

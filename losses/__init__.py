@@ -24,10 +24,8 @@ from edgeslam_torch.losses.photometric import PhotometricLoss, SmoothnessLoss, d
 from edgeslam_torch.losses.reprojection import ReprojectionLoss
 from edgeslam_torch.losses.robust import Kernel, rho
 from edgeslam_torch.losses.total import TotalLoss
-from edgeslam_torch.losses.weighting import AdaptiveScales, TermScale, robust_sigma
 
 __all__ = [
-    "AdaptiveScales",
     "AngleForm",
     "AngleLoss",
     "BerHu",
@@ -48,7 +46,6 @@ __all__ = [
     "Residuals",
     "SILog",
     "SmoothnessLoss",
-    "TermScale",
     "TotalLoss",
     "back_project",
     "dissimilarity",
@@ -57,7 +54,6 @@ __all__ = [
     "project",
     "reduce",
     "rho",
-    "robust_sigma",
     "sample_depth",
     "warp_to",
 ]

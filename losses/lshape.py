@@ -17,7 +17,6 @@ from edgeslam_torch.losses.base import (
     project,
     reduce,
 )
-from edgeslam_torch.losses.edge_alignment import PairGeometry, depth_slopes, pair_geometry
 from edgeslam_torch.losses.inputs import check_mask, check_shapes, in_full_precision
 from edgeslam_torch.losses.robust import Kernel
 
@@ -258,17 +257,7 @@ class LShapeLoss(torch.nn.Module):
 def junction_residuals(
     Rt: Tensor, rays: Tensor, inverse_depth: Tensor, uv_j: Tensor, arms_j: Tensor, K: Tensor, cosines: bool
 ) -> tuple[Tensor, Tensor]:
-    """Residuals ``(R, ...)`` of `junction_rows` alone, and which pairs lie in front; arguments as it takes them."""
-    points, uv = _ends(Rt, rays, inverse_depth, K)
-    unit, _ = _arms(uv)
-    rows = _cosine(unit) - _cosine(arms_j) if cosines else _sines(arms_j, unit)
-    return torch.cat((uv[:, 0] - uv_j, rows)), points.front.all(0)
-
-
-def junction_rows(
-    Rt: Tensor, rays: Tensor, inverse_depth: Tensor, uv_j: Tensor, arms_j: Tensor, K: Tensor, cosines: bool
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Residuals of L-junctions seen from their target frames, with derivatives; trailing axes broadcast.
+    """Residuals of L-junctions seen from their target frames; trailing axes broadcast.
 
     Args:
         Rt: Relative motions ``(3, 4, ...)`` from host to target.
@@ -281,45 +270,23 @@ def junction_rows(
             between projected and observed arms.
 
     Returns:
-        Residuals ``(R, ...)``: corner u and v [px], then one or two angle rows; derivatives by the relative pose
-        ``(R, 6, ...)`` and by the inverse depths ``(R, 3, ...)``; and which pairs lie in front ``(...)``.
+        Residuals ``(R, ...)``: corner u and v [px], then one or two angle rows; and which pairs lie in front ``(...)``.
     """
-    points, uv = _ends(Rt, rays, inverse_depth, K)
-    f = K[:2].reshape(2, *[1] * points.x.ndim)
-    by_pose = _point_jacobian(points.x, points.y, points.iz) * f[:, None]  # (2, 6, 3, ...)
-    by_depth = torch.stack(depth_slopes(points, Rt[:, 3, None])[:2]) * f  # (2, 3, ...)
-    unit, length = _arms(uv)
-    if cosines:
-        rows = _cosine(unit) - _cosine(arms_j)
-        slope = (unit.flip(1) - _cosine(unit) * unit) / length
-    else:
-        rows = _sines(arms_j, unit)
-        slope = (torch.stack((-arms_j[1], arms_j[0])) - rows * unit) / length
-    turn = (slope[:, None] * (by_pose[:, :, 1:] - by_pose[:, :, :1])).sum(0)  # (6, 2, ...)
-    corner, end = -(slope * by_depth[:, :1]).sum(0), (slope * by_depth[:, 1:]).sum(0)  # (2, ...)
-    none = torch.zeros_like(corner)
-    if cosines:
-        turn = turn.sum(1, keepdim=True)
-        stretch = torch.cat((corner.sum(0, keepdim=True), end))[None]
-    else:
-        stretch = torch.stack((corner, torch.stack((end[0], none[0])), torch.stack((none[0], end[1]))), 1)
-    r = torch.cat((uv[:, 0] - uv_j, rows))
-    J = torch.cat((by_pose[:, :, 0], turn.transpose(0, 1)))
-    Jd = torch.cat((torch.stack((by_depth[:, 0], none, none), 1), stretch))
-    return r, J, Jd, points.front.all(0)
+    # The point times its inverse depth, so that points at infinity need no special case.
+    R, t = Rt[:, :3, None], Rt[:, 3, None]
+    q = R[:, 0] * rays[0] + R[:, 1] * rays[1] + R[:, 2] + t * inverse_depth
+    front = q[2] > 1e-6
+    f, c = (k.reshape(2, *[1] * front.ndim) for k in (K[:2], K[2:]))
+    uv = q[:2] / torch.where(front, q[2], 1.0) * f + c
+    unit = _arms(uv)
+    rows = _cosine(unit) - _cosine(arms_j) if cosines else _sines(arms_j, unit)
+    return torch.cat((uv[:, 0] - uv_j, rows)), front.all(0)
 
 
-def _ends(Rt: Tensor, rays: Tensor, inverse_depth: Tensor, K: Tensor) -> tuple[PairGeometry, Tensor]:
-    """Corner and arm ends in the target frame, elements ``(3, ...)``, and their pixels ``(2, 3, ...)``."""
-    points = pair_geometry(Rt[:, :, None], rays, inverse_depth)
-    return points, torch.stack((points.x * K[0] + K[2], points.y * K[1] + K[3]))
-
-
-def _arms(uv: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit directions ``(2, 2, ...)``, coordinate first, and lengths ``(2, ...)`` of both arms."""
+def _arms(uv: Tensor) -> Tensor:
+    """Unit directions ``(2, 2, ...)`` of both arms, coordinate first."""
     arm = uv[:, 1:] - uv[:, :1]
-    length = arm.square().sum(0).clamp_min(1e-12).sqrt()
-    return arm / length, length
+    return arm / arm.square().sum(0).clamp_min(1e-12).sqrt()
 
 
 def _cosine(unit: Tensor) -> Tensor:
@@ -328,10 +295,3 @@ def _cosine(unit: Tensor) -> Tensor:
 
 def _sines(seen: Tensor, unit: Tensor) -> Tensor:
     return seen[0] * unit[1] - seen[1] * unit[0]
-
-
-def _point_jacobian(x: Tensor, y: Tensor, iz: Tensor) -> Tensor:
-    """Normalised coordinates by the left tangent of the pose, ``(2, 6, ...)``."""
-    o = torch.zeros_like(x)
-    rows = (iz, o, -x * iz, -x * y, 1.0 + x * x, -y, o, iz, -y * iz, -1.0 - y * y, x * y, x)
-    return torch.stack(rows).view(2, 6, *x.shape)

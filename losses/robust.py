@@ -1,18 +1,11 @@
 """Robust kernels on squared whitened residuals, with their iteratively-reweighted weights."""
 
-from enum import StrEnum
-
 import torch
 from torch import Tensor
 
+from edgeslam_torch.types import Kernel
 
-class Kernel(StrEnum):
-    """Shape of the robust cost."""
-
-    L2 = "l2"
-    HUBER = "huber"
-    CAUCHY = "cauchy"
-    TUKEY = "tukey"
+__all__ = ["Kernel", "rho"]
 
 
 def rho(s: Tensor, kernel: Kernel, delta: float) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,7 @@ MAY_USE = {part: row.may_use | set(LAYERS[0].parts) for row in LAYERS for part i
 NEVER = {"evo", "djitellopy", "open3d", "torchvision", "pypose"}
 """GPL, or measured and found wanting (docs/decisions/27-dependencies.md); tests may use some as outside oracles."""
 
-ORACLES = {"gtsam": "edgeslam_torch.optim.benchmark"}
+ORACLES = {"gtsam": "edgeslam_torch.eval.benchmark.windows"}
 """Packages that one module may compare with when they happen to be installed."""
 
 HEAVY = ("torch", "kornia", "cv2", "numpy", "scipy", "onnxruntime", "onnx", "matplotlib", "tensorboard", "rerun", "av")

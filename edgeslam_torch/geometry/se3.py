@@ -79,6 +79,15 @@ def inverse(T: FloatArray) -> FloatArray:
     return out
 
 
+def adjoint(T: FloatArray) -> FloatArray:
+    """``(..., 6, 6)`` with ``T exp(xi) T^-1 = exp(adjoint(T) xi)`` for rigid motions ``(..., 4, 4)``."""
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., :3, 3:] = hat(T[..., :3, 3]) @ R
+    return out
+
+
 def transform(T: FloatArray, p: FloatArray) -> FloatArray:
     """Points ``(N, 3)`` transformed by ``T`` ``(4, 4)``."""
     return p @ T[:3, :3].T + T[:3, 3]

@@ -8,8 +8,6 @@ import numpy as np
 from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.losses.robust import Kernel
-from edgeslam_torch.losses.weighting import AdaptiveScales
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.freed_depths import Weight
@@ -18,9 +16,10 @@ from edgeslam_torch.mapping.local_loop_closure import MAX_DRIFT_PX, reobserve_al
 from edgeslam_torch.mapping.motion_terms import ALIKE_AT_THE_END
 from edgeslam_torch.mapping.refinement import refine_all, whole_map, window_problem, write_back
 from edgeslam_torch.mapping.window_edges import WindowEdges
-from edgeslam_torch.optim.adaptive import term_residuals, with_scales
+from edgeslam_torch.optim.adaptive import AdaptiveScales, term_residuals, with_scales
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, StopReason, WindowProblem, WindowResult
+from edgeslam_torch.types import Kernel
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +35,7 @@ that stops at a percent of the cost, or is damped by the stiff modes, never reac
 def lm_config(config: WindowConfig) -> LmConfig:
     """Solver settings of every refinement of the map."""
     return LmConfig(
+        solver=config.solver,
         diagnostics=False,
         max_iterations=0 if config.reprojection == "off" else ITERATIONS,
         mu=MU,

@@ -8,7 +8,6 @@ from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.frontend.canny import canny, edge_thresholds
 from edgeslam_torch.frontend.edges import extract_edges
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.mapping.window_terms import (
@@ -20,7 +19,7 @@ from edgeslam_torch.mapping.window_terms import (
     make_structure,
 )
 from edgeslam_torch.optim.problem import WindowProblem
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import CycleForm, FloatArray
 
 FEW_ANCHORS = 100
 """Anchors of a keyframe below which edges join its window: as many as start a map, and as tracking's threshold."""

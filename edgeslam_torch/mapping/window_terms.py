@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.frontend.corners import Junctions, detect_junctions
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.optim.edge_association import EdgeField, associate_edges, edge_field, nearest_edges
-from edgeslam_torch.optim.kernels.junction_blocks import collinearity_prior
 from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms
-from edgeslam_torch.types import Edges, FloatArray, IntArray
+from edgeslam_torch.types import CycleForm, Edges, FloatArray, IntArray
 
 UNKNOWN_SIGMA_LOG = 0.35
 """Relative sigma of a corner's depths without a measurement."""
@@ -250,6 +248,41 @@ def _junction_depths(structure: Structure, config: TermConfig) -> tuple[FloatArr
         information = np.eye(3) / (UNKNOWN_SIGMA_LOG * np.maximum(prior, 1e-6)[:, :, None]) ** 2
     known = (given.sum(2) >= 3).all(1) & (prior > 0).all(1)
     return prior, information, known
+
+
+def collinearity_prior(
+    fraction: FloatArray, inverse_depth: FloatArray, sigma: FloatArray, weak_sigma: float = 10.0
+) -> tuple[FloatArray, FloatArray]:
+    """Straight arms through the depths of their edge points: prior of a `JunctionTerms`, paper eq. (26).
+
+    A straight line in space has inverse depths that are linear along its image, so the arm is a line fitted to the
+    inverse depths of its points; their scatter about it is the collinearity residual.
+
+    Args:
+        fraction: Position of each point along its arm ``(C, 2, M)``, 0 at the corner and 1 at the arm's end; NaN
+            without a point.
+        inverse_depth: Their inverse depths ``(C, 2, M)`` [1/m].
+        sigma: Their standard deviations ``(C, 2, M)`` [1/m].
+        weak_sigma: Weak prior for junctions without points [1/m].
+
+    Returns:
+        Expected inverse depths of corner and arm ends ``(C, 3)`` and their information ``(C, 3, 3)``.
+    """
+    s = np.asarray(fraction, dtype=np.float64)
+    given = np.isfinite(s) & np.isfinite(inverse_depth) & (np.asarray(sigma) > 0)
+    s = np.where(given, s, 0.0)
+    w = np.where(given, 1.0 / np.where(given, sigma, 1.0), 0.0)
+    z = np.where(given, inverse_depth, 0.0)
+    A = np.zeros((*s.shape, 3))
+    A[..., 0] = 1.0 - s
+    A[:, 0, :, 1], A[:, 1, :, 2] = s[:, 0], s[:, 1]
+    A = (A * w[..., None]).reshape(len(s), -1, 3)
+    right = (z * w).reshape(len(s), -1)
+    mean = z.sum((1, 2)) / np.maximum(given.sum((1, 2)), 1)
+    weak = 1.0 / weak_sigma**2
+    information = np.einsum("cki,ckj->cij", A, A) + weak * np.eye(3)
+    moment = np.einsum("cki,ck->ci", A, right) + weak * mean[:, None]
+    return np.linalg.solve(information, moment[..., None])[..., 0], information
 
 
 def _match(

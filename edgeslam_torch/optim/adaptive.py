@@ -1,47 +1,138 @@
-"""Adaptive weights of a window: every term whitened by the robust scale of its own residuals, paper eq. (28)."""
+"""Adaptive weights of a window, and its losses as the paper defines them, paper eq. (28).
 
-from dataclasses import replace
+The paper balances its terms by "adaptive weighting based on uncertainty" and gives no formula. Here every term is
+whitened by a robust standard deviation of its own residuals, so that the weights of eq. (28) are pure numbers.
+"""
+
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from edgeslam_torch.geometry import se3_torch as lie
-from edgeslam_torch.losses.cycle import CycleForm
-from edgeslam_torch.losses.edge_alignment import (
-    alignment_row,
-    pair_geometry,
-    partner_line,
-    relative_depth_row,
-    round_trip_row,
-)
-from edgeslam_torch.losses.lshape import junction_residuals
-from edgeslam_torch.losses.reprojection import camera_points, reprojection_residuals
-from edgeslam_torch.losses.weighting import AdaptiveScales
-from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms, WindowProblem
-from edgeslam_torch.types import FloatArray, IntArray
+from edgeslam_torch.geometry.robust_statistics import robust_sigma
+from edgeslam_torch.optim.problem import LmConfig, WindowProblem
+from edgeslam_torch.optim.window import Window
+from edgeslam_torch.types import CycleForm, FloatArray
+
+SMALLEST_SIGMA = 1e-9
+"""Below this a term's residuals are rounding errors, and its weight would be meaningless."""
 
 
-def term_residuals(problem: WindowProblem) -> dict[str, Tensor]:
+@dataclass(frozen=True, slots=True)
+class TermScale:
+    """Running robust standard deviation of one term."""
+
+    sigma: float
+    """Current estimate, in the residual's unit."""
+    low: float
+    """Lower bound, so that no term dominates after a window with unusually small residuals."""
+    high: float
+    """Upper bound: a bad window must not silence a term."""
+    smoothing: float = 0.8
+    """Weight of the old value (in its logarithm) at each update."""
+    min_count: int = 30
+    """Minimum number of residuals for an update."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.low <= self.sigma <= self.high:
+            raise ValueError(f"need 0 < low <= sigma <= high, got {self.low}, {self.sigma}, {self.high}")
+        if not 0 <= self.smoothing < 1:
+            raise ValueError(f"smoothing must lie in [0, 1), got {self.smoothing}")
+
+    def updated(self, residual: FloatArray) -> "TermScale":
+        """The scale updated with one window's valid residuals."""
+        if residual.size < self.min_count:
+            return self
+        new = robust_sigma(residual)
+        if not new >= 0:
+            return self
+        new = min(max(new, self.low), self.high)
+        smooth = self.sigma**self.smoothing * new ** (1.0 - self.smoothing)
+        return replace(self, sigma=min(max(smooth, self.low), self.high))
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptiveScales:
+    """Scales of all terms of a window."""
+
+    terms: dict[str, TermScale] = field(
+        default_factory=lambda: {
+            "reproj": TermScale(1.0, 0.5, 3.0),
+            "edge": TermScale(1.0, 0.5, 3.0),
+            "cycle": TermScale(0.05, 0.01, 0.3),
+            "corner": TermScale(1.0, 0.5, 3.0),
+            "angle": TermScale(0.05, 0.01, 0.3),
+        }
+    )
+
+    def updated(self, residuals: dict[str, FloatArray]) -> "AdaptiveScales":
+        """Scales updated with one window; terms without residuals are unchanged."""
+        new = {k: s.updated(residuals[k]) if k in residuals else s for k, s in self.terms.items()}
+        return replace(self, terms=new)
+
+
+def term_residuals(problem: WindowProblem) -> dict[str, FloatArray]:
     """Residuals of every term of a window at its current state, by name of its scale.
 
     Returns:
-        ``reproj`` [px of the finest octave], ``edge`` [px], ``cycle`` (relative depth, or px in the paper's form),
-        ``corner`` [px] and ``angle`` (sine or cosine), each ``(N,)``; terms that are off and elements behind a camera
-        are omitted.
+        ``reproj`` [px of the finest octave], ``edge`` [px], ``cycle`` (relative depth) or ``cycle px`` (the paper's
+        form), ``corner`` [px] and ``angle`` (sine or cosine), ``(N, k)`` each; terms that are off and elements behind a
+        camera are omitted.
     """
+    window = Window(_unit(problem), LmConfig())
+    normals = dict(zip(window.blocks, window.linearise(window.start).blocks, strict=True))
     out = {}
-    K = torch.tensor(problem.K, dtype=torch.float64)
-    if len(problem.obs_pose):
-        T, p_w = _values(problem.T_c_w), _values(problem.p_w)
-        _, p_c = camera_points(T, p_w, _index(problem.obs_pose), _index(problem.obs_anchor))
-        r = reprojection_residuals(p_c, _values(problem.uv).mT, K) * _values(problem.inv_sigma)
-        out["reproj"] = r[:, p_c[2] > 0].flatten()
-    if problem.edges is not None and len(problem.edges.pair_edge):
-        out |= _edge_residuals(problem.edges, problem.T_c_w, K)
-    if problem.junctions is not None and len(problem.junctions.pair_junction):
-        out |= _junction_residuals(problem.junctions, problem.T_c_w, K)
+    anchors = normals[window.anchors]
+    if anchors.front.any():
+        out["reproj"] = anchors.r[anchors.front]
+    if window.edges is not None and problem.edges is not None:
+        r, front = normals[window.edges].r, normals[window.edges].front
+        used = front & (problem.edges.pair_inv_sigma > 0)
+        if used.any():
+            out["edge"] = r[used, :1]
+        used = front & (problem.edges.pair_inverse_depth > 0)
+        if used.any() and problem.edges.cycle_sigma > 0:
+            relative = problem.edges.cycle is CycleForm.RELATIVE_DEPTH
+            out["cycle" if relative else "cycle px"] = r[used, 1:]
+    if window.junctions is not None and problem.junctions is not None:
+        r = normals[window.junctions].r[normals[window.junctions].front]
+        if problem.junctions.inv_sigma_px > 0:
+            out["corner"] = r[:, :2]
+        if problem.junctions.inv_sigma_angle > 0:
+            out["angle"] = r[:, 2:]
     return out
+
+
+def window_losses(problem: WindowProblem) -> dict[str, float]:
+    """Mean squared residual of every active term, and their weighted sum, paper eqs. (15)-(28).
+
+    Args:
+        problem: A window; terms that it leaves out are left out.
+
+    Returns:
+        ``reprojection_px2``, ``alignment_px2``, ``cycle`` (relative depth squared) or ``cycle_px2``, ``angle``
+        (cosine squared), and ``total``: the sum with every term divided by its robust variance, so that 1 is what
+        normally distributed residuals contribute. Empty for a window without terms.
+    """
+    junctions = problem.junctions if problem.junctions is None else replace(problem.junctions, cosines=True)
+    found = term_residuals(replace(problem, inv_sigma=np.ones(len(problem.uv)), junctions=junctions))
+    losses, total = {}, 0.0
+    for name, key in _LOSSES.items():
+        if key in found:
+            losses[name] = (
+                float((found[key] ** 2).sum(-1).mean()) if found[key].ndim > 1 else float((found[key] ** 2).mean())
+            )
+            sigma = robust_sigma(found[key])
+            total += losses[name] / sigma**2 if sigma > SMALLEST_SIGMA else 0.0
+    return losses | {"total": total} if losses else {}
+
+
+_LOSSES = {
+    "reprojection_px2": "reproj",
+    "alignment_px2": "edge",
+    "cycle": "cycle",
+    "cycle_px2": "cycle px",
+    "angle": "angle",
+}
 
 
 def with_scales(problem: WindowProblem, scales: AdaptiveScales, alike: float = 1.0) -> WindowProblem:
@@ -72,53 +163,13 @@ def with_scales(problem: WindowProblem, scales: AdaptiveScales, alike: float = 1
     return replace(problem, edges=edges, junctions=junctions)
 
 
-def _edge_residuals(terms: EdgeTerms, T_c_w: FloatArray, K: Tensor) -> dict[str, Tensor]:
-    edge = _index(terms.pair_edge)
-    Rt = _motions(T_c_w, np.asarray(terms.host)[terms.pair_edge], terms.pair_pose)
-    ray = ((_values(terms.uv)[edge] - K[2:]) / K[:2]).mT
-    g = pair_geometry(Rt, ray, _values(terms.inverse_depth)[edge])
-    out = {}
-    used = g.front & (_values(terms.pair_inv_sigma) > 0)
-    if bool(used.any()):
-        px = torch.ones((), dtype=torch.float64)
-        out["edge"] = alignment_row(g, partner_line(_values(terms.pair_uv).mT, _values(terms.pair_normal).mT, px, K))[
-            used
-        ]
-    held = _values(terms.pair_inverse_depth)
-    used = g.front & (held > 0)
-    if terms.cycle_sigma > 0 and bool(used.any()):
-        held = torch.where(held > 0, held, 1.0)
-        if terms.cycle is CycleForm.RELATIVE_DEPTH:
-            out["cycle"] = relative_depth_row(g, held)[used]
-        else:
-            out["cycle px"] = round_trip_row(g, Rt, ray, held, K)[:, used].flatten()
-    return out
-
-
-def _junction_residuals(terms: JunctionTerms, T_c_w: FloatArray, K: Tensor) -> dict[str, Tensor]:
-    corner = _index(terms.pair_junction)
-    Rt = _motions(T_c_w, np.asarray(terms.host)[terms.pair_junction], terms.pair_pose)
-    rays = ((_values(terms.uv)[corner] - K[2:]) / K[:2]).permute(2, 1, 0)
-    depth = _values(terms.inverse_depth)[corner].mT
-    arms = _values(terms.pair_arms).permute(2, 1, 0)
-    r, front = junction_residuals(Rt, rays, depth, _values(terms.pair_uv).mT, arms, K, terms.cosines)
-    out = {}
-    if terms.inv_sigma_px > 0:
-        out["corner"] = r[:2, front].flatten()
-    if terms.inv_sigma_angle > 0:
-        out["angle"] = r[2:, front].flatten()
-    return out
-
-
-def _motions(T_c_w: FloatArray, host: IntArray, target: IntArray) -> Tensor:
-    """``(3, 4, P)`` from host to target."""
-    T = _values(T_c_w)
-    return (T[_index(target)] @ lie.inverse(T)[_index(host)])[:, :3].permute(1, 2, 0)
-
-
-def _values(x: FloatArray) -> Tensor:
-    return torch.as_tensor(np.asarray(x, dtype=np.float64))
-
-
-def _index(x: IntArray) -> Tensor:
-    return torch.as_tensor(np.asarray(x, dtype=np.int64))
+def _unit(problem: WindowProblem) -> WindowProblem:
+    """The window with edges and junctions not whitened."""
+    edges, junctions = problem.edges, problem.junctions
+    if edges is not None:
+        edges = replace(
+            edges, pair_inv_sigma=np.ones(len(edges.pair_edge)), cycle_sigma=1.0 if edges.cycle_sigma > 0 else 0.0
+        )
+    if junctions is not None:
+        junctions = replace(junctions, inv_sigma_px=1.0, inv_sigma_angle=1.0)
+    return replace(problem, edges=edges, junctions=junctions)

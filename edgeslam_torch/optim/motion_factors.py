@@ -10,26 +10,21 @@ derivative :math:`-[R_i g]_\times \phi`. A heading is the turn about the vertica
 """
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 
 class MotionTerms:
-    """Motion factors of one window; adds itself to the normal equations.
-
-    Small dense blocks: numpy, where a call costs a tenth of a torch call.
-    """
+    """Motion factors of one window; adds itself to the normal equations."""
 
     def __init__(
         self,
         centres: tuple[CentreFactor, ...],
         gravity: tuple[GravityFactor, ...],
         headings: tuple[HeadingFactor, ...],
-        column: list[int],
+        column: IntArray,
     ) -> None:
         """Prepare the terms.
 
@@ -40,25 +35,12 @@ class MotionTerms:
             column: Free-pose number of each pose, -1 for a fixed one.
         """
         self.centres, self.gravity, self.headings = centres, gravity, headings
-        self.column = np.asarray(column)
+        self.column = column
 
-    def cost(self, T_c_w: Tensor) -> float:
-        """Sum of squared whitened residuals."""
-        if not (self.centres or self.gravity or self.headings):
-            return 0.0
-        T = T_c_w.cpu().numpy()
-        total = sum(centre_cost(T[f.pose], f)[0] for f in self.centres)
-        total += sum(float(np.sum(gravity_residual(T[f.pose], f) ** 2)) for f in self.gravity)
-        turned = ((heading_residual(T[f.pose], f), f.information) for f in self.headings)
-        return total + sum(float(e @ A @ e) for e, A in turned)
-
-    def linearise(self, T_c_w: Tensor, H: Tensor, g: Tensor) -> float:
-        """Add the terms to ``H (6F, 6F)`` and ``g (6F,)``; returns their cost."""
-        if not (self.centres or self.gravity or self.headings):
-            return 0.0
-        T = T_c_w.cpu().numpy()
-        F = H.shape[0] // 6
-        H_np, g_np = np.zeros((F, 6, F, 6)), np.zeros((F, 6))
+    def linearise(self, T: FloatArray, H: FloatArray, g: FloatArray) -> float:
+        """Add the terms at poses ``(W, 4, 4)`` to ``H (6F, 6F)`` and ``g (6F,)``; returns their cost."""
+        F = len(H) // 6
+        H, g = H.reshape(F, 6, F, 6), g.reshape(F, 6)
         total = 0.0
         for centre in self.centres:
             value, by_centre = centre_cost(T[centre.pose], centre)
@@ -68,17 +50,17 @@ class MotionTerms:
             into, R = column[free], T[centre.pose[free], :3, :3]
             K = len(centre.pose)
             A = centre.information.reshape(K, 3, K, 3)[free][:, :, free]
-            np.add.at(g_np[:, :3], into, -np.einsum("kab,kb->ka", R, by_centre[free]))
+            np.add.at(g[:, :3], into, -np.einsum("kab,kb->ka", R, by_centre[free]))
             turned = np.einsum("iab,ibjd,jcd->iajc", R, A, R)
-            H_np[into[:, None], :3, into[None], :3] += turned.transpose(0, 2, 1, 3)
+            H[into[:, None], :3, into[None], :3] += turned.transpose(0, 2, 1, 3)
         for gravity in self.gravity:
             r = gravity_residual(T[gravity.pose], gravity)
             J = gravity_jacobian(T[gravity.pose], gravity)
             total += float(np.sum(r**2))
             for k, i in enumerate(self.column[gravity.pose]):
                 if i >= 0:
-                    H_np[i, 3:, i, 3:] += J[k].T @ J[k]
-                    g_np[i, 3:] += J[k].T @ r[k]
+                    H[i, 3:, i, 3:] += J[k].T @ J[k]
+                    g[i, 3:] += J[k].T @ r[k]
         for heading in self.headings:
             e, J = heading_residual(T[heading.pose], heading), heading_jacobian(T[heading.pose], heading)
             slope = heading.information @ e
@@ -86,11 +68,9 @@ class MotionTerms:
             column = self.column[heading.pose]
             free = np.flatnonzero(column >= 0)
             into, J = column[free], J[free]
-            np.add.at(g_np[:, 3:], into, J * slope[free, None])
+            np.add.at(g[:, 3:], into, J * slope[free, None])
             curvature = np.einsum("ia,ij,jb->ijab", J, heading.information[np.ix_(free, free)], J)
-            H_np[into[:, None], 3:, into[None], 3:] += curvature
-        H += torch.as_tensor(H_np.reshape(H.shape))
-        g += torch.as_tensor(g_np.ravel())
+            H[into[:, None], 3:, into[None], 3:] += curvature
         return total
 
 

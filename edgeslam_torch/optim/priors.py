@@ -3,27 +3,23 @@
 import math
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.optim.problem import PosePrior, RelativePosePrior, ScalePrior
+from edgeslam_torch.types import FloatArray, IntArray
 
 _BERNOULLI = (-0.5, 1.0 / 12.0, 0.0, -1.0 / 720.0, 0.0, 1.0 / 30240.0)
 """B_n / n! for n = 1..6, the series of the inverse left Jacobian."""
 
 
 class PriorTerms:
-    """Pose and scale priors of one window; adds itself to the normal equations.
-
-    A handful of 6-vectors: numpy, where a call costs a tenth of a torch call.
-    """
+    """Pose and scale priors of one window; adds itself to the normal equations."""
 
     def __init__(
         self,
         poses: tuple[PosePrior, ...],
         scales: tuple[ScalePrior, ...],
-        column: list[int],
+        column: IntArray,
         relative: tuple[RelativePosePrior, ...] = (),
     ) -> None:
         """Prepare the terms.
@@ -39,35 +35,15 @@ class PriorTerms:
         self.scales = [p for p in scales if column[p.pose_i] >= 0 or column[p.pose_j] >= 0]
         self.column = column
 
-    def cost(self, T_c_w: Tensor) -> float:
-        """Sum of squared whitened residuals."""
-        if not (self.poses or self.relative or self.scales):
-            return 0.0
-        T = T_c_w.cpu().numpy()
-        total = 0.0
-        for prior in self.poses:
-            r = pose_prior_residual(T[prior.pose], prior)
-            total += float(r @ prior.information @ r)
-        for relation in self.relative:
-            r = relative_prior(T[relation.pose_i], T[relation.pose_j], relation)[0]
-            total += float(r @ relation.information @ r)
-        for scale in self.scales:
-            total += scale_prior(T[scale.pose_i], T[scale.pose_j], scale)[0] ** 2
-        return total
-
-    def linearise(self, T_c_w: Tensor, H: Tensor, g: Tensor) -> float:
-        """Add the terms to ``H (6F, 6F)`` and ``g (6F,)``; returns their cost."""
-        if not (self.poses or self.relative or self.scales):
-            return 0.0
-        T = T_c_w.cpu().numpy()
-        H_np, g_np = np.zeros(H.shape), np.zeros(g.shape)
+    def linearise(self, T: FloatArray, H: FloatArray, g: FloatArray) -> float:
+        """Add the terms at poses ``(W, 4, 4)`` to ``H (6F, 6F)`` and ``g (6F,)``; returns their cost."""
         total = 0.0
         for prior in self.poses:
             r = pose_prior_residual(T[prior.pose], prior)
             J = inverse_left_jacobian(r)
             k = 6 * self.column[prior.pose]
-            H_np[k : k + 6, k : k + 6] += J.T @ prior.information @ J
-            g_np[k : k + 6] += J.T @ (prior.information @ r)
+            H[k : k + 6, k : k + 6] += J.T @ prior.information @ J
+            g[k : k + 6] += J.T @ (prior.information @ r)
             total += float(r @ prior.information @ r)
         for relation in self.relative:
             r, by_i, by_j = relative_prior(T[relation.pose_i], T[relation.pose_j], relation)
@@ -76,21 +52,19 @@ class PriorTerms:
             free = [(slice(6 * k, 6 * k + 6), J) for pose, J in blocks if (k := self.column[pose]) >= 0]
             for rows, J in free:
                 weighted = J.T @ relation.information
-                g_np[rows] += weighted @ r
+                g[rows] += weighted @ r
                 for columns, other in free:
-                    H_np[rows, columns] += weighted @ other
+                    H[rows, columns] += weighted @ other
         for scale in self.scales:
             r_s, J_i, J_j = scale_prior(T[scale.pose_i], T[scale.pose_j], scale)
             total += r_s**2
-            row = np.zeros(len(g_np))
+            row = np.zeros(len(g))
             for pose, J in ((scale.pose_i, J_i), (scale.pose_j, J_j)):
                 k = 6 * self.column[pose]
                 if k >= 0:
                     row[k : k + 6] += J
-            H_np += np.outer(row, row)
-            g_np += r_s * row
-        H += torch.as_tensor(H_np)
-        g += torch.as_tensor(g_np)
+            H += np.outer(row, row)
+            g += r_s * row
         return total
 
 
@@ -117,16 +91,7 @@ def relative_prior(T_i: np.ndarray, T_j: np.ndarray, prior: RelativePosePrior) -
     T_j_i = T_j @ se3.inverse(T_i)
     r = se3.log(T_j_i @ se3.inverse(np.asarray(prior.T_j_i, dtype=np.float64)))
     J = inverse_left_jacobian(r)
-    return r, -J @ adjoint(T_j_i), J
-
-
-def adjoint(T: np.ndarray) -> np.ndarray:
-    """``(6, 6)`` with ``T exp(d) T^-1 = exp(adjoint(T) d)``, translation first."""
-    R = T[:3, :3]
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = R
-    out[:3, 3:] = se3.hat(T[:3, 3]) @ R
-    return out
+    return r, -J @ se3.adjoint(T_j_i), J
 
 
 def scale_prior(T_i: np.ndarray, T_j: np.ndarray, prior: ScalePrior) -> tuple[float, np.ndarray, np.ndarray]:

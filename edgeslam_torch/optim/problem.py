@@ -1,15 +1,14 @@
 """Input and output records of a refinement, in numpy."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeslam_torch.geometry.robust_statistics import CHI2_1DOF_95, CHI2_2DOF_95
-from edgeslam_torch.losses.cycle import CycleForm
-from edgeslam_torch.losses.robust import Kernel
-from edgeslam_torch.types import FloatArray, IntArray
+from edgeslam_torch.types import BoolArray, CycleForm, FloatArray, IntArray, Kernel
 
 
 class StopReason(StrEnum):
@@ -132,7 +131,7 @@ class JunctionTerms:
     """``(C, 3)`` start [1/m]."""
     prior: FloatArray
     """``(C, 3)`` expected inverse depths: along a straight arm inverse depth is linear in the image, so the
-    collinearity of its edge points (paper eq. 26) is the fit of a line to theirs, see `collinearity_prior`."""
+    collinearity of its edge points (paper eq. 26) is the fit of a line to theirs, see `mapping.window_terms`."""
     prior_information: FloatArray
     """``(C, 3, 3)`` inverse covariance of ``prior``."""
     pair_junction: IntArray
@@ -199,7 +198,7 @@ class WindowProblem:
 
     T_c_w: FloatArray
     """``(W, 4, 4)`` world-to-camera poses."""
-    pose_fixed: NDArray[np.bool_]
+    pose_fixed: BoolArray
     """``(W,)`` poses that hold the gauge and do not move."""
     p_w: FloatArray
     """``(A, 3)`` anchors in the world."""
@@ -235,13 +234,6 @@ class LmConfig:
     """Where the kernel departs from least squares [standard deviations]."""
     edge_delta: float = CHI2_1DOF_95**0.5
     """The same for edge and junction rows, which are scalars."""
-    device: str = "cpu"
-    """Device of torch, such as ``cuda``; windows of usual size are too small to gain from it."""
-    compile: bool = False
-    """Run the hot kernels through ``torch.compile``: pays when many windows are solved."""
-    float32_blocks: bool = True
-    """Single precision for edge blocks and for the coupling of anchors and poses; the reduced system is always
-    double."""
     mu: float = 1e-4
     """Initial damping, relative to the diagonal of the normal matrix."""
     mu_max: float = 1e8
@@ -251,12 +243,13 @@ class LmConfig:
     """Largest tangent component below which a step is the last."""
     gradient_tolerance: float = 1e-9
     """Largest gradient component, in units of its curvature, below which no step is tried."""
-    min_depth: float = 1e-3
-    """Points nearer than this in front of a camera count as behind it (map units)."""
     behind_px: float = 1000.0
     """Residual of an observation behind the camera, and upper limit of all residuals."""
+    solver: str = "compiled"
+    """What computes residuals and derivatives: the ``compiled`` loops of `optim.kernels`, or the ``modules`` of
+    `losses` and automatic differentiation."""
     losses: bool = False
-    """Report the losses of the result, evaluated by the loss modules (a tenth of a second for a whole map)."""
+    """Report the losses of the result."""
     diagnostics: bool = True
     """Report rank deficiency and the newest pose's covariance (costs one more linearisation)."""
     rank_tolerance: float = 1e-9
@@ -265,6 +258,8 @@ class LmConfig:
     def __post_init__(self) -> None:
         if self.max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, got {self.max_iterations}")
+        if self.solver not in ("compiled", "modules"):
+            raise ValueError(f"solver must be compiled or modules, got {self.solver!r}")
         if self.delta <= 0 or self.mu <= 0:
             raise ValueError(f"delta and mu must be positive, got {self.delta} and {self.mu}")
 
@@ -279,7 +274,7 @@ class WindowResult:
     """``(A, 3)`` refined anchors."""
     chi2: FloatArray
     """``(M,)`` squared whitened reprojection residuals at the result; infinite behind the camera."""
-    in_front: NDArray[np.bool_]
+    in_front: BoolArray
     """``(M,)`` whether the anchor lies in front of the camera."""
     cost_before: float
     """Robust cost (sum of rho) at the start."""
@@ -302,3 +297,13 @@ class WindowResult:
     """The losses of the result by name, as `window_losses` states them; empty unless asked for."""
     pose_covariance: FloatArray = field(default_factory=lambda: np.full((6, 6), np.nan))
     """``(6, 6)`` of the last free pose, left tangent, anchors marginalised; NaN when not computed."""
+
+
+class Rows(Protocol):
+    """Whitened residuals of every kind ``(n, k)``, their derivatives by poses and blocks ``(n, k, 6 + m)``, and which
+    lie in front of the camera ``(n,)``; arguments as those of `optim.kernels`."""
+
+    reprojection: Callable[..., Any]
+    inverse_depth: Callable[..., Any]
+    edges: Callable[..., Any]
+    junctions: Callable[..., Any]

@@ -58,12 +58,9 @@ def _guarded(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 @lru_cache(maxsize=1)
 def _problems() -> tuple[Any, Any]:
     """The seeded window, complete and with points only, solved once to warm caches."""
-    import torch
-
-    from edgeslam_torch.optim.benchmark import points_only, seeded_window
+    from edgeslam_torch.eval.benchmark.windows import points_only, seeded_window
     from edgeslam_torch.optim.local_ba import refine_window
 
-    torch.set_num_threads(1)
     window = seeded_window()
     problems = window.problem, points_only(window).problem
     for problem in problems:
@@ -73,7 +70,7 @@ def _problems() -> tuple[Any, Any]:
 
 def _solver() -> dict[str, Any]:
     """CPU milliseconds of the window, of its points alone, and of gtsam on those points when it is installed."""
-    from edgeslam_torch.optim.benchmark import refine_with_gtsam
+    from edgeslam_torch.eval.benchmark.windows import refine_with_gtsam
     from edgeslam_torch.optim.local_ba import refine_window
     from edgeslam_torch.optim.problem import LmConfig
 

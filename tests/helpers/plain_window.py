@@ -1,7 +1,4 @@
-"""The window's normal equations as docs/theory/window.md states them, for tests: plain residuals, derivatives by
-automatic differentiation, one dense matrix. Slow and short; the kernels in
-`edgeslam_torch/optim/kernels` are compared with it.
-"""
+"""The window's normal equations for tests: plain residuals, automatic derivatives, one dense matrix."""
 
 from collections.abc import Callable
 from typing import NamedTuple

@@ -13,7 +13,7 @@ from edgeslam_torch.losses.base import ResidualLoss, back_project, move, project
 from edgeslam_torch.losses.cycle import CycleForm, CycleLoss
 from edgeslam_torch.losses.edge_alignment import EdgeAlignmentLoss
 from edgeslam_torch.losses.lshape import AngleForm, AngleLoss, CollinearityLoss, LShapeLoss, cosine
-from edgeslam_torch.losses.reprojection import ReprojectionLoss, reprojection_residuals
+from edgeslam_torch.losses.reprojection import ReprojectionLoss
 from edgeslam_torch.losses.robust import Kernel, rho
 
 K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 480.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -313,8 +313,6 @@ def test_residuals_are_predicted_minus_observed():
     right = torch.tensor([[3.0, -4.0], [-7.0, 4.0]], dtype=torch.float64)
     window = ReprojectionLoss().residuals(torch.stack((T, T)), p, seen[:, None], K)
     torch.testing.assert_close(window.value[:, 0], right)
-    rows = reprojection_residuals(p.mT.expand(3, 2), seen.mT, torch.tensor([500.0, 500.0, 320.0, 240.0]))
-    torch.testing.assert_close(rows, right.mT)
     across = torch.tensor([[0.6, 0.8]], dtype=torch.float64)
     edge = EdgeAlignmentLoss().residuals(T, torch.tensor([[420.0, 190.0]]), p[:, 2], seen[1:], across, K)
     torch.testing.assert_close(edge.value, right[1:] @ across.mT)  # -7 * 0.6 + 4 * 0.8

@@ -10,13 +10,13 @@ from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.config import DepthConfig, SlamConfig, WindowConfig
 from edgeslam_torch.eval.benchmark.ablation import pickled
-from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.refinement import choose_window, refine, window_problem
 from edgeslam_torch.mapping.window_edges import FEW_ANCHORS, WindowEdges, term_config
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.slam import EdgeSlam
+from edgeslam_torch.types import CycleForm
 
 ALWAYS = WindowConfig(in_flight="always")
 

@@ -11,6 +11,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.mapping.window_terms import (
     Structure,
     TermConfig,
+    collinearity_prior,
     edge_terms,
     junction_terms,
     make_structure,
@@ -162,3 +163,16 @@ def test_structure_of_an_image_points_its_normals_to_the_bright_side():
     assert structure.junctions is not None
     assert len(structure.junctions) == 4
     assert make_structure(grey, np.zeros((0, 2)), np.zeros(0), np.zeros(0)).junctions is None
+
+
+def test_collinearity_prior_fits_lines_to_inverse_depths(rng):
+    truth = np.array([[0.4, 0.3, 0.5]])
+    s = rng.uniform(0.05, 1, (1, 2, 9))
+    depth = truth[:, :1, None] * (1 - s) + truth[:, 1:, None] * s
+    s[0, 1, 4:] = np.nan
+    mean, information = collinearity_prior(s, depth, np.full(s.shape, 0.01))
+    np.testing.assert_allclose(mean, truth, atol=1e-4)
+    assert (np.linalg.eigvalsh(information) > 1e3).all()
+    nothing, weak = collinearity_prior(np.full((1, 2, 3), np.nan), np.ones((1, 2, 3)), np.ones((1, 2, 3)))
+    assert np.isfinite(nothing).all()
+    assert (np.linalg.eigvalsh(weak) > 0).all()

@@ -1,16 +1,11 @@
 """Window refinement on clean, contaminated and degenerate synthetic worlds."""
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from edgeslam_torch.geometry import se3
-from edgeslam_torch.losses.cycle import CycleForm
-from edgeslam_torch.losses.robust import Kernel
-from edgeslam_torch.optim.benchmark import (
+from edgeslam_torch.eval.benchmark.windows import (
     K,
     Noise,
     SeededWindow,
@@ -19,15 +14,7 @@ from edgeslam_torch.optim.benchmark import (
     refine_with_gtsam,
     seeded_window,
 )
-from edgeslam_torch.optim.kernels import compiled, point_blocks, schur
-from edgeslam_torch.optim.kernels.edge_blocks import EdgeTiles, edge_cost, edge_weights
-from edgeslam_torch.optim.kernels.junction_blocks import (
-    JunctionPairs,
-    collinearity_prior,
-    junction_cost,
-    junction_weights,
-)
-from edgeslam_torch.optim.kernels.pair_blocks import Robust
+from edgeslam_torch.geometry import se3
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import (
     DepthPriors,
@@ -38,10 +25,11 @@ from edgeslam_torch.optim.problem import (
     WindowProblem,
     WindowResult,
 )
+from edgeslam_torch.types import CycleForm, Kernel
 
 SMALL = WindowSize(poses=6, fixed=2, anchors=150, observations=600, edges=200, pairs=600, junctions=20)
 CLEAN = Noise(px=0.0, depth=0.0)
-TIGHT = LmConfig(max_iterations=60, cost_tolerance=1e-13, float32_blocks=False)
+TIGHT = LmConfig(max_iterations=60, cost_tolerance=1e-13)
 
 
 def pose_error(result: WindowResult, window: SeededWindow) -> float:
@@ -111,11 +99,9 @@ def test_chi2_is_in_the_callers_order():
     np.testing.assert_allclose(result.chi2, expected, rtol=1e-9, atol=1e-20)
 
 
-def test_order_of_observations_and_of_chunks_does_not_matter(rng, monkeypatch):
+def test_order_of_observations_does_not_matter(rng):
     window = seeded_window(4, SMALL)
     before = refine_window(window.problem, TIGHT)
-    monkeypatch.setattr(point_blocks, "_FEW_POSES", 0)
-    monkeypatch.setattr(point_blocks, "_ANCHORS_PER_CHUNK", 16)
     after = refine_window(keep(window.problem, rng.permutation(len(window.problem.uv))), TIGHT)
     assert after.cost_after == pytest.approx(before.cost_after, rel=1e-10)
     np.testing.assert_allclose(after.T_c_w, before.T_c_w, atol=1e-7)
@@ -168,14 +154,6 @@ def test_twenty_starts_end_in_one_minimum(rng):
         assert result.stop.converged, result.stop
         costs.append(result.cost_after)
     assert max(costs) - min(costs) < 1e-6 * min(costs)
-
-
-def test_single_precision_edges_end_in_the_same_minimum():
-    problem = seeded_window(7, SMALL).problem
-    double = refine_window(problem, TIGHT)
-    single = refine_window(problem, replace(TIGHT, float32_blocks=True))
-    assert single.cost_after == pytest.approx(double.cost_after, rel=1e-6)
-    np.testing.assert_allclose(single.T_c_w, double.T_c_w, atol=1e-5)
 
 
 @pytest.mark.parametrize("kernel", [Kernel.HUBER, Kernel.CAUCHY, Kernel.TUKEY])
@@ -308,19 +286,6 @@ def test_pose_prior_holds_what_nothing_else_does():
     assert pose_error(result, window) < 0.02
     for i in (0, 5):
         np.testing.assert_allclose(result.T_c_w[i], window.T_c_w[i], atol=1e-3)
-
-
-def test_collinearity_prior_fits_lines_to_inverse_depths(rng):
-    truth = np.array([[0.4, 0.3, 0.5]])
-    s = rng.uniform(0.05, 1, (1, 2, 9))
-    depth = truth[:, :1, None] * (1 - s) + truth[:, 1:, None] * s
-    s[0, 1, 4:] = np.nan
-    mean, information = collinearity_prior(s, depth, np.full(s.shape, 0.01))
-    np.testing.assert_allclose(mean, truth, atol=1e-4)
-    assert (np.linalg.eigvalsh(information) > 1e3).all()
-    nothing, weak = collinearity_prior(np.full((1, 2, 3), np.nan), np.ones((1, 2, 3)), np.ones((1, 2, 3)))
-    assert np.isfinite(nothing).all()
-    assert (np.linalg.eigvalsh(weak) > 0).all()
 
 
 # -- degenerate windows ---------------------------------------------------------------------------------------
@@ -476,84 +441,3 @@ def test_gtsam_finds_the_same_minimum():
     result = refine_window(problem, TIGHT)
     assert result.cost_after == pytest.approx(cost, rel=1e-8)
     np.testing.assert_allclose(result.T_c_w, T_c_w, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_compiled_kernels_find_the_same_minimum(monkeypatch, tmp_path, caplog):
-    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(compiled, "_compiled", {})
-    if shutil.which("g++") is None and shutil.which("clang++") is None:
-        pytest.skip("no C++ compiler for torch.compile")
-    problem = seeded_window(23, SMALL).problem
-    eager, fast = refine_window(problem, TIGHT), refine_window(problem, replace(TIGHT, compile=True))
-    assert fast.cost_after == pytest.approx(eager.cost_after, rel=1e-9)
-    np.testing.assert_allclose(fast.T_c_w, eager.T_c_w, atol=1e-8)
-    assert "eager from now on" not in caplog.text, "every kernel was compiled"
-
-
-def test_a_compiler_that_fails_leaves_the_eager_result(monkeypatch, caplog):
-    def broken(function):
-        def call(*args):
-            raise RuntimeError("no C++ compiler\nat all")
-
-        return call
-
-    monkeypatch.setattr(torch, "compile", broken)
-    monkeypatch.setattr(compiled, "_compiled", {})
-    monkeypatch.setattr(compiled, "_reported", set())
-    problem = seeded_window(24, SMALL).problem
-    with caplog.at_level("WARNING"):
-        asked = refine_window(problem, replace(TIGHT, compile=True))
-    assert asked.T_c_w.tobytes() == refine_window(problem, TIGHT).T_c_w.tobytes()
-    messages = [r.getMessage() for r in caplog.records]
-    assert messages == ["torch.compile failed, eager from now on: no C++ compiler"]
-
-
-def test_the_default_device_may_be_named():
-    problem = replace(seeded_window(25, SMALL).problem, scale_priors=(ScalePrior(0, 5, 0.6, 0.1),))
-    here, named = refine_window(problem, TIGHT), refine_window(problem, replace(TIGHT, device="cpu:0"))
-    np.testing.assert_array_equal(here.T_c_w, named.T_c_w)
-
-
-def test_kernels_stay_on_their_device():
-    """Meta tensors have shapes and a device but no values: an operation that mixed devices would raise here."""
-    with torch.device("meta"):
-        E, f, g = 20, {"dtype": torch.float32}, {"dtype": torch.float64}
-        B, T, L = 2, 3, 16
-        K, Rt = torch.zeros(4, **f), torch.zeros(3, 4, B, T, 1, **f)
-        pair, some = torch.zeros(B, T, L, **f), torch.zeros(3, dtype=torch.int64)
-        robust = Robust(pair, Kernel.HUBER, 2.0)
-        line, ray = torch.zeros(3, B, T, L, **f), torch.zeros(2, B, 1, L, **f)
-        edge, edges = torch.zeros(1, B, L, **f), EdgeTiles(ray, line, pair, pair, K, None, robust)
-        rays, arms = torch.zeros(2, 3, B, 1, L, **f), torch.zeros(2, 2, B, T, L, **f)
-        weight = torch.zeros(4, B, T, L, **f)
-        corner, corners = torch.zeros(3, B, L, **f), JunctionPairs(rays, line[:2], arms, weight, K, False, robust)
-        place = torch.zeros(B, 9, L, dtype=torch.int64)
-        pixel, three = torch.zeros(B, 2, L, **g), torch.zeros(3, **g)
-        seen = point_blocks.Observed(
-            some[:B], place[:, :3], pixel, pixel, pixel[:, 0], some, three, three, three, min_depth=1e-3
-        )
-        places = point_blocks.Places(
-            place.flatten(), place[:, 0].flatten(), some[:B], some, place[:, :6], place[:, :3].flatten(), 3 * E, True
-        )
-        point = (torch.zeros(4, 4, 4, **g), torch.zeros(3, E, **g), seen)
-        out = [*edge_weights(Rt, edge, edges._replace(form=CycleForm.RELATIVE_DEPTH))]
-        out += [*edge_weights(Rt, edge, edges._replace(form=CycleForm.PIXEL)), edge_cost(Rt, edge, edges)]
-        out += [*junction_weights(Rt, corner, corners), junction_cost(Rt, corner, corners)]
-        linear = point_blocks.point_normals(*point, places, Kernel.HUBER, 2.0)
-        out += [*linear.system, *linear[1:], point_blocks.point_cost(*point, Kernel.HUBER, 2.0)]
-        out += [*point_blocks.coupled(linear.system, places, three[0], torch.float32)]
-        for size in (1, 3):
-            V, g = torch.zeros(size * (size + 1) // 2, B, L, **f), torch.zeros(size, B, L, **f)
-            out += [*schur.eliminate(V, g, torch.zeros(B, T, 6, size, L, **f), torch.zeros((), **f))]
-            factor = schur.inverse_cholesky(torch.zeros(size * (size + 1) // 2, E, **f), 1e-4)
-            out += [schur.unwhiten(factor, schur.whiten(factor, torch.zeros(size, E, **f)))]
-        assert {t.device.type for t in out} == {"meta"}
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_a_gpu_finds_the_same_minimum():
-    problem = replace(seeded_window(21, SMALL).problem, scale_priors=(ScalePrior(0, 5, 0.6, 0.1),))
-    here, there = refine_window(problem, TIGHT), refine_window(problem, replace(TIGHT, device="cuda"))
-    assert there.cost_after == pytest.approx(here.cost_after, rel=1e-9)
-    np.testing.assert_allclose(there.T_c_w, here.T_c_w, atol=1e-7)

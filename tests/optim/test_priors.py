@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-import torch
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.optim.priors import PriorTerms, adjoint, relative_prior
+from edgeslam_torch.optim.priors import PriorTerms, relative_prior
 from edgeslam_torch.optim.problem import RelativePosePrior
 
 STEP = 1e-6
@@ -23,7 +22,7 @@ def relation(rng, T_i, T_j, off=0.3):
 
 def test_adjoint_carries_a_tangent_through_a_pose(rng):
     T, d = pose(rng), rng.normal(0.0, 0.2, 6)
-    np.testing.assert_allclose(se3.exp(adjoint(T) @ d), T @ se3.exp(d) @ se3.inverse(T), atol=1e-12)
+    np.testing.assert_allclose(se3.exp(se3.adjoint(T) @ d), T @ se3.exp(d) @ se3.inverse(T), atol=1e-12)
 
 
 def test_relative_prior_is_met_by_the_relative_pose_alone(rng):
@@ -49,15 +48,18 @@ def test_relative_prior_derivatives(rng, which):
 def test_the_normal_equations_are_those_of_the_cost(rng):
     """One pose fixed, one free: the gradient is half the cost's derivative, and a step leads to the prior."""
     T = np.stack([pose(rng), pose(rng)])
-    terms = PriorTerms((), (), [-1, 0], (relation(rng, *T, off=0.05),))
-    H, g = torch.zeros((6, 6), dtype=torch.float64), torch.zeros(6, dtype=torch.float64)
-    cost = terms.linearise(torch.as_tensor(T), H, g)
-    assert cost == pytest.approx(terms.cost(torch.as_tensor(T)))
+    terms = PriorTerms((), (), np.array([-1, 0]), (relation(rng, *T, off=0.05),))
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    cost = terms.linearise(T, H, g)
+
+    def at(T):
+        return terms.linearise(T, np.zeros((6, 6)), np.zeros(6))
+
     for k in range(6):
         moved = [T.copy(), T.copy()]
         for s, m in zip((1, -1), moved, strict=True):
             m[1] = se3.exp(s * STEP * np.eye(6)[k]) @ T[1]
-        slope = (terms.cost(torch.as_tensor(moved[0])) - terms.cost(torch.as_tensor(moved[1]))) / (2 * STEP)
+        slope = (at(moved[0]) - at(moved[1])) / (2 * STEP)
         assert 2.0 * float(g[k]) == pytest.approx(slope, rel=1e-4, abs=1e-6)
-    T[1] = se3.exp(-np.linalg.solve(H.numpy(), g.numpy())) @ T[1]
-    assert terms.cost(torch.as_tensor(T)) < 1e-2 * cost
+    T[1] = se3.exp(-np.linalg.solve(H, g)) @ T[1]
+    assert at(T) < 1e-2 * cost

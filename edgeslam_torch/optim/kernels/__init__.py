@@ -1,1 +1,4 @@
-"""The arithmetic of the solver: normal equations of anchors, edges and junctions, and their elimination."""
+"""The solver's arithmetic as plain loops: residuals with their derivatives, normal equations, Schur complement.
+
+The modules of `losses` define the residuals; these loops are tested against their automatic derivatives.
+"""

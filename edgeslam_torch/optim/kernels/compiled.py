@@ -1,53 +1,45 @@
-"""torch.compile for the solver's hot kernels: opt-in, with eager fallback."""
+"""Plain loops compiled by numba: one thread, sums in the order in which they are written, on every processor alike.
 
-import functools
+A compiled function calls compiled functions of its own file only: numba's cache notices changes of that file alone.
+"""
+
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar, cast
 
-import torch
+import numba
+from numba.core import event
 
 logger = logging.getLogger(__name__)
 
-_compiled: dict[Callable[..., Any], Callable[..., Any]] = {}
-_reported: set[str] = set()
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def kernel(function: Callable[..., Any], compile: bool) -> Callable[..., Any]:
-    """``function``, or its compiled form: compiled for the first sizes, then once more for dynamic sizes.
+def compiled(function: Function) -> Function:
+    """The function, compiled at its first call for the types that it is given.
 
-    Compiling takes seconds to minutes at the first call and needs a C++ compiler (on the CPU). On failure, a warning
-    is logged once and the function runs eagerly from then on.
-
-    Args:
-        function: A function of tensors without state and without branches on their values.
-        compile: Whether to compile it.
+    Machine code is cached beside the file or, where that cannot be written, in the user's cache directory
+    (``NUMBA_CACHE_DIR`` chooses another); where none can be written, every process compiles anew.
     """
-    if not compile:
-        return function
-    if function not in _compiled:
-        _compiled[function] = _with_fallback(function, torch.compile(function))
-    return _compiled[function]
+    settings: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    try:
+        return cast(Function, numba.njit(cache=True, **settings)(function))
+    except RuntimeError:  # no directory that can be written
+        return cast(Function, numba.njit(**settings)(function))
 
 
-def _with_fallback(function: Callable[..., Any], fast: Callable[..., Any]) -> Callable[..., Any]:
-    from torch._dynamo.exc import TorchDynamoException
+class _Notice(event.Listener):  # type: ignore[misc]  # numba has no types
+    """Says once that a first call takes long."""
 
-    failed = False
+    said = False
 
-    @functools.wraps(function)
-    def call(*args: Any) -> Any:
-        nonlocal failed
-        if not failed:
-            try:
-                return fast(*args)
-            # No compiler, no space, unsupported; or cached code for other sizes, which asserts.
-            except (TorchDynamoException, RuntimeError, OSError, AssertionError) as error:
-                failed = True
-                cause = str(error).strip().split("\n")[0]
-                if cause not in _reported:  # without a compiler every kernel fails alike
-                    _reported.add(cause)
-                    logger.warning("torch.compile failed, eager from now on: %s", cause)
-        return function(*args)
+    def on_start(self, event: Any) -> None:
+        if not self.said:
+            self.said = True
+            logger.warning("compiling the solver; once on this machine, some seconds")
 
-    return call
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+event.register("numba:compile", _Notice())

@@ -1,17 +1,11 @@
-"""Solver benchmark on a seeded window, beside gtsam: ``python -m edgeslam_torch.optim.benchmark``."""
+"""Seeded windows for the solver, and gtsam's solution of them."""
 
-import argparse
-import json
-import os
-import sys
 import time
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms, LmConfig, WindowProblem
 from edgeslam_torch.types import FloatArray, IntArray
 
@@ -236,68 +230,3 @@ def refine_with_gtsam(problem: WindowProblem, iterations: int) -> tuple[float, f
     seconds = time.process_time() - start
     T_w_c = np.stack([result.atPose3(gtsam.symbol("x", i)).matrix() for i in range(len(problem.T_c_w))])
     return seconds, 2.0 * graph.error(result), se3.inverse(T_w_c)
-
-
-def benchmark(repeats: int = 5, iterations: int = 5) -> dict[str, float | str]:
-    """Median CPU milliseconds of the seeded window, on one thread, everything in one run.
-
-    Runs are interleaved, so that other load affects both; CPU time (user and system, all threads) because wall time
-    depends on other load. Ours covers everything from arrays to result; gtsam's graph is built before its timing
-    starts.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
-    if cores:  # gtsam's own threads, where it has any
-        os.sched_setaffinity(0, {min(cores)})
-    window = seeded_window()
-    half = seeded_window(size=WindowSize(edges=5_000, pairs=20_000))
-    config = LmConfig(max_iterations=iterations, cost_tolerance=0.0, diagnostics=False)
-    fast = replace(config, compile=True)
-    start = time.process_time()
-    compiled = refine_window(window.problem, fast).cost_after
-    compile_s = time.process_time() - start
-    off = abs(compiled / refine_window(window.problem, config).cost_after - 1.0)
-    runs = {
-        "all_ms": lambda: refine_window(window.problem, config),
-        "all_compiled_ms": lambda: refine_window(window.problem, fast),
-        "half_edges_ms": lambda: refine_window(half.problem, config),
-        "points_ms": lambda: refine_window(points_only(window).problem, config),
-    }
-    times: dict[str, list[float]] = {name: [] for name in (*runs, "gtsam_points_ms")}
-    note = "gtsam is not installed"
-    for k in range(repeats + 1):
-        for name, run in runs.items():
-            start = time.process_time()
-            run()
-            times[name].append(1e3 * (time.process_time() - start))
-        try:
-            times["gtsam_points_ms"].append(1e3 * refine_with_gtsam(window.problem, iterations)[0])
-            note = "gtsam on the points only"
-        except ModuleNotFoundError:
-            times["gtsam_points_ms"].append(float("nan"))
-        if k == 0:  # warms caches
-            for values in times.values():
-                values.clear()
-    torch.set_num_threads(threads)
-    if cores:
-        os.sched_setaffinity(0, cores)
-    return {
-        "oracle": note,
-        **{name: round(float(np.median(values)), 1) for name, values in times.items()},
-        "compile_s": round(compile_s, 1),
-        "compiled_cost_differs_by": float(f"{off:.1e}"),
-    }
-
-
-def main() -> None:
-    """Write the benchmark as one line of JSON."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--iterations", type=int, default=5)
-    options = parser.parse_args()
-    sys.stdout.write(json.dumps(benchmark(options.repeats, options.iterations)) + "\n")
-
-
-if __name__ == "__main__":
-    main()

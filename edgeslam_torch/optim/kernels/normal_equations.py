@@ -1,0 +1,239 @@
+"""Normal equations of blocks (anchors, inverse depths) that poses see, their elimination and back-substitution.
+
+With residuals :math:`r`, derivatives :math:`J_x` by poses and :math:`J_y` by blocks, and robust weights :math:`w`,
+
+.. math:: \\begin{pmatrix} H & W^T \\\\ W & V \\end{pmatrix} \\begin{pmatrix} \\delta \\\\ y \\end{pmatrix}
+   = -\\begin{pmatrix} g_x \\\\ g_y \\end{pmatrix}, \\qquad V = \\sum w J_y^T J_y, \\quad W = \\sum w J_y^T J_x .
+
+V consists of one small matrix a block, so that the poses' steps follow from :math:`S = H - W^T V^{-1} W` alone.
+"""
+
+import math
+
+import numpy as np
+
+from edgeslam_torch.optim.kernels.compiled import compiled
+from edgeslam_torch.types import BoolArray, FloatArray, IntArray
+
+L2, HUBER, CAUCHY, TUKEY = range(4)
+"""Robust kernels, in the order of `losses.robust.Kernel`."""
+PIVOT = 1e-12
+"""A pivot below this fraction of its diagonal entry is a direction that nothing observes."""
+
+
+@compiled
+def rho(s: float, kernel: int, delta: float) -> tuple[float, float]:
+    """Robust cost of a squared residual and its derivative, the weight, as `losses.robust.rho`."""
+    c2 = delta * delta
+    if kernel == HUBER and s > c2:
+        outside = math.sqrt(s)
+        return c2 + 2.0 * delta * (outside - delta), delta / outside
+    if kernel == CAUCHY:
+        return c2 * math.log1p(s / c2), c2 / (c2 + s)
+    if kernel == TUKEY:
+        rest = max(1.0 - s / c2, 0.0)
+        return c2 / 3.0 * (1.0 - rest * rest * rest), rest * rest
+    return s, 1.0
+
+
+@compiled
+def accumulate(
+    r: FloatArray,
+    J: FloatArray,
+    front: BoolArray,
+    far: FloatArray,
+    joint: bool,
+    kernel: int,
+    delta: float,
+    block: IntArray,
+    view: IntArray,
+    slot: IntArray,
+    V: FloatArray,
+    g: FloatArray,
+    H: FloatArray,
+    g_pose: FloatArray,
+    W: FloatArray,
+) -> float:
+    """Add residuals to the normal equations and return their robust cost.
+
+    Args:
+        r: Whitened residuals ``(n, k)``.
+        J: Their derivatives ``(n, k, 6 + m)`` by the pose and the block.
+        front: ``(n,)`` which lie in front of the camera.
+        far: ``(n,)`` square of one that does not, and the largest that counts: farther ones have no weight.
+        joint: Whether the k rows are one measurement, with one weight, or each has its own.
+        kernel: Robust kernel.
+        delta: Its width.
+        block: ``(n,)`` of each.
+        view: ``(n,)`` row of ``H`` and ``g_pose``; -1 for a pose that does not move.
+        slot: ``(n,)`` row of ``W``; not read where ``view`` is -1.
+        V: ``(B, m, m)`` of the blocks, added to.
+        g: ``(B, m)`` their gradients, added to.
+        H: ``(F, 6, 6)`` of the poses, added to.
+        g_pose: ``(F, 6)`` their gradients, added to.
+        W: ``(S, m, 6)`` couplings of blocks and poses, added to.
+    """
+    n, rows, m = len(r), r.shape[1], J.shape[2] - 6
+    cost = 0.0
+    for e in range(n):
+        joint_square = 0.0
+        for k in range(rows):
+            joint_square += r[e, k] * r[e, k]
+        for k in range(rows):
+            square = joint_square if joint else r[e, k] * r[e, k]
+            counts = front[e] and square < far[e]
+            value, weight = rho(square if counts else far[e], kernel, delta)
+            if k == 0 or not joint:
+                cost += value
+            if not counts:
+                continue
+            b, v, s = block[e], view[e], slot[e]
+            for i in range(m):
+                slope = weight * J[e, k, 6 + i]
+                g[b, i] += slope * r[e, k]
+                for j in range(m):
+                    V[b, i, j] += slope * J[e, k, 6 + j]
+                if v >= 0:
+                    for j in range(6):
+                        W[s, i, j] += slope * J[e, k, j]
+            if v >= 0:
+                for i in range(6):
+                    slope = weight * J[e, k, i]
+                    g_pose[v, i] += slope * r[e, k]
+                    for j in range(6):
+                        H[v, i, j] += slope * J[e, k, j]
+    return cost
+
+
+@compiled
+def coupled(
+    relative: FloatArray,
+    adjoint: FloatArray,
+    block: IntArray,
+    view: IntArray,
+    target_slot: IntArray,
+    host_slot: IntArray,
+    W: FloatArray,
+) -> None:
+    """Carry couplings with relative poses to those with hosts and targets: ``xi = xi_target - Ad xi_host``.
+
+    Args:
+        relative: ``(P, m, 6)`` couplings of pairs.
+        adjoint: ``(R, 6, 6)`` of the relative poses.
+        block: ``(P,)``.
+        view: ``(P,)`` relative poses.
+        target_slot: ``(P,)`` rows of ``W``; -1 for a target that does not move.
+        host_slot: ``(B,)`` the same of the hosts.
+        W: ``(S, m, 6)``, added to.
+    """
+    for p in range(len(relative)):
+        target, host = target_slot[p], host_slot[block[p]]
+        for i in range(relative.shape[1]):
+            for j in range(6):
+                if target >= 0:
+                    W[target, i, j] += relative[p, i, j]
+                if host >= 0:
+                    for k in range(6):
+                        W[host, i, j] -= relative[p, i, k] * adjoint[view[p], k, j]
+
+
+@compiled
+def eliminate(
+    V: FloatArray,
+    g: FloatArray,
+    W: FloatArray,
+    start: IntArray,
+    column: IntArray,
+    mu: float,
+    S: FloatArray,
+    right: FloatArray,
+) -> FloatArray:
+    """Take blocks out of the poses' system.
+
+    Args:
+        V: ``(B, m, m)``, where m is 1 or 3.
+        g: ``(B, m)``.
+        W: ``(S, m, 6)``, block by block.
+        start: ``(B + 1,)`` first row of ``W`` of each block.
+        column: ``(S,)`` pose of each row, rising within a block.
+        mu: Damping relative to the diagonal of ``V``.
+        S: ``(6 F, 6 F)``; on and above its diagonal, ``W^T V^-1 W`` is subtracted.
+        right: ``(6 F,)``; ``W^T V^-1 g`` is subtracted.
+
+    Returns:
+        ``(B, m, m)`` Cholesky factors of the damped blocks, below the diagonal; on it the pivots' reciprocal roots,
+        zero in directions that nothing observes: they neither move nor affect the poses.
+    """
+    m = V.shape[1]
+    factor = np.zeros(V.shape)
+    most = 0
+    for b in range(len(V)):
+        most = max(most, start[b + 1] - start[b])
+    Y, y = np.empty((most, m, 6)), np.empty(m)
+    for b in range(len(V)):
+        L = factor[b]
+        for i in range(m):
+            for j in range(i):
+                rest = V[b, i, j]
+                for k in range(j):
+                    rest -= L[i, k] * L[j, k]
+                L[i, j] = rest * L[j, j]
+            full = V[b, i, i] * (1.0 + mu)
+            rest = full
+            for k in range(i):
+                rest -= L[i, k] * L[i, k]
+            L[i, i] = 1.0 / math.sqrt(rest) if rest > PIVOT * full else 0.0
+        first, count = start[b], start[b + 1] - start[b]
+        for i in range(m):  # y = L^-1 g and Y = L^-1 W
+            y[i] = g[b, i]
+            for k in range(i):
+                y[i] -= L[i, k] * y[k]
+            y[i] *= L[i, i]
+            for s in range(count):
+                for c in range(6):
+                    rest = W[first + s, i, c]
+                    for k in range(i):
+                        rest -= L[i, k] * Y[s, k, c]
+                    Y[s, i, c] = rest * L[i, i]
+        for s in range(count):
+            row = 6 * column[first + s]
+            for i in range(m):
+                for c in range(6):
+                    right[row + c] -= Y[s, i, c] * y[i]
+            for t in range(s, count):
+                to, A, B = 6 * column[first + t], Y[s], Y[t]
+                for c in range(6):
+                    S_row = S[row + c]
+                    if m == 3:  # written out: half the time of a loop
+                        u, v, w = A[0, c], A[1, c], A[2, c]
+                        for d in range(6):
+                            S_row[to + d] -= u * B[0, d] + v * B[1, d] + w * B[2, d]
+                    else:
+                        for d in range(6):
+                            S_row[to + d] -= A[0, c] * B[0, d]
+    return factor
+
+
+@compiled
+def back_substitute(
+    factor: FloatArray, g: FloatArray, W: FloatArray, start: IntArray, column: IntArray, delta: FloatArray
+) -> FloatArray:
+    """Steps of the blocks ``(B, m)`` that belong to the poses' ``delta (F, 6)``: ``-V^-1 (g + W delta)``."""
+    m = g.shape[1]
+    step = np.empty(g.shape)
+    for b in range(len(g)):
+        L, x = factor[b], step[b]
+        for i in range(m):
+            x[i] = -g[b, i]
+            for s in range(start[b], start[b + 1]):
+                for c in range(6):
+                    x[i] -= W[s, i, c] * delta[column[s], c]
+        for i in range(m):
+            for k in range(i):
+                x[i] -= L[i, k] * x[k]
+            x[i] *= L[i, i]
+        for i in range(m - 1, -1, -1):
+            for k in range(i + 1, m):
+                x[i] -= L[k, i] * x[k]
+            x[i] *= L[i, i]
+    return step
