@@ -297,8 +297,7 @@ class WindowConfig:
     in_flight_edges: int = 300
     """Edge pixels per keyframe there, each associated in two neighbours."""
     solver: str = "compiled"
-    """What computes residuals and derivatives of windows: ``compiled`` loops, or the ``modules`` of
-    `edgeslam_torch.losses` with automatic differentiation, the same to rounding and many times slower."""
+    """Residuals by ``compiled`` loops, or by the ``modules`` of `edgeslam_torch.losses`: the same, far slower."""
     telemetry: str = "every"
     """Where the drone's displacements, heights and gravity keep the map's scale and level the same all over: in
     ``every`` refinement, in the ``last`` one, or ``off``."""

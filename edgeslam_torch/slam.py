@@ -12,7 +12,6 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
-import torch
 
 from edgeslam_torch.atlas.atlas import Atlas, Join
 from edgeslam_torch.atlas.loops import Closure
@@ -110,7 +109,6 @@ class EdgeSlam:
             raise TypeError(f"a SlamConfig is expected, got {type(config).__name__}")
         # One thread each: spinning thread pools slow each other down (docs/decisions/24-threads-and-seeds.md).
         cv2.setNumThreads(1)
-        torch.set_num_threads(1)
         self.camera = camera
         self.config = config = config or SlamConfig()
         depth = depth if depth is not None else _depth_from_config(config)

@@ -22,27 +22,6 @@ SILENCE_S = 1.0
 
 FloatArray = NDArray[np.floating]
 IntArray = NDArray[np.integer]
-BoolArray = NDArray[np.bool_]
-
-
-class Kernel(StrEnum):
-    """Shape of a robust cost."""
-
-    L2 = "l2"
-    HUBER = "huber"
-    CAUCHY = "cauchy"
-    TUKEY = "tukey"
-
-
-class CycleForm(StrEnum):
-    """What the edge cycle compares."""
-
-    PIXEL = "pixel"
-    """Paper eq. (23): the pixel after the round trip against the pixel before it [px]."""
-    PARALLAX = "parallax"
-    """The same divided by the expected parallax ``f |t| / z``; no unit."""
-    RELATIVE_DEPTH = "relative depth"
-    """``(z - d_j) / (z + d_j)`` of the depth predicted in frame j; no unit."""
 
 
 _SHOWN = 4

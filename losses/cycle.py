@@ -1,5 +1,6 @@
 """Edge cycle consistency, paper eqs. (17)-(23)."""
 
+from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import torch
@@ -18,9 +19,17 @@ from edgeslam_torch.losses.base import (
 from edgeslam_torch.losses.inputs import check_shapes, in_full_precision
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.losses.sampling import sample
-from edgeslam_torch.types import CycleForm
 
-__all__ = ["CycleForm", "CycleLoss", "expected_parallax_px", "sample_depth"]
+
+class CycleForm(StrEnum):
+    """What the cycle compares."""
+
+    PIXEL = "pixel"
+    """Paper eq. (23): the pixel after the round trip against the pixel before it [px]."""
+    PARALLAX = "parallax"
+    """The same divided by the expected parallax ``f |t| / z``; no unit."""
+    RELATIVE_DEPTH = "relative depth"
+    """``(z - d_j) / (z + d_j)`` of the depth predicted in frame j; no unit."""
 
 
 class CycleLoss(ResidualLoss):

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from edgeslam_torch.types import Kernel
+from edgeslam_torch.geometry.robust_statistics import Kernel
 
 __all__ = ["Kernel", "rho"]
 

@@ -25,7 +25,20 @@ NEVER = {"evo", "djitellopy", "open3d", "torchvision", "pypose"}
 ORACLES = {"gtsam": "edgeslam_torch.eval.benchmark.windows"}
 """Packages that one module may compare with when they happen to be installed."""
 
-HEAVY = ("torch", "kornia", "cv2", "numpy", "scipy", "onnxruntime", "onnx", "matplotlib", "tensorboard", "rerun", "av")
+HEAVY = (
+    "torch",
+    "kornia",
+    "cv2",
+    "numpy",
+    "numba",
+    "scipy",
+    "onnxruntime",
+    "onnx",
+    "matplotlib",
+    "tensorboard",
+    "rerun",
+    "av",
+)
 
 
 def sources() -> list[Path]:
@@ -128,7 +141,7 @@ def test_table_allows_only_imports_in_use():
     [
         ("writers.ply", "mapping.mapper"),
         ("geometry.se3", "optim.problem"),
-        ("optim.kernels.point_blocks", "optim.local_ba"),
+        ("optim.kernels.edges", "optim.local_ba"),
         ("readers.layouts.tum", "readers.source"),
         ("files.atomic", "geometry.se3"),
         ("eval.metrics.align", "eval.judge.cells"),
@@ -177,6 +190,10 @@ def loaded_by(statement: str) -> set[str]:
 )
 def test_nothing_heavy_is_imported_at_first(statement):
     assert loaded_by(statement) == set()
+
+
+def test_slam_and_runs_load_no_torch():
+    assert "torch" not in loaded_by("import edgeslam_torch.run, edgeslam_torch.slam")
 
 
 def test_commands_that_only_list_their_options_load_no_torch():

@@ -1,5 +1,7 @@
 """Quantiles, robust spreads and weights that several stages share."""
 
+from enum import StrEnum
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -15,6 +17,15 @@ MAD_TO_SIGMA = 1.4826
 """Median absolute deviation to standard deviation of a normal distribution."""
 TUKEY_95 = 4.685
 """Width of Tukey's biweight [standard deviations]: 95 % efficiency on normal errors (Huber 1981)."""
+
+
+class Kernel(StrEnum):
+    """Shape of a robust cost."""
+
+    L2 = "l2"
+    HUBER = "huber"
+    CAUCHY = "cauchy"
+    TUKEY = "tukey"
 
 
 def median(x: FloatArray) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.robust_statistics import Kernel
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.freed_depths import Weight
@@ -19,7 +20,6 @@ from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.adaptive import AdaptiveScales, term_residuals, with_scales
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, StopReason, WindowProblem, WindowResult
-from edgeslam_torch.types import Kernel
 
 logger = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
+from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95, Kernel
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.revisit import is_back
 from edgeslam_torch.map.slam_map import SlamMap
@@ -25,7 +25,7 @@ from edgeslam_torch.optim.problem import (
     WindowResult,
 )
 from edgeslam_torch.optim.unit import MIN_EXTENT, with_same_depths, with_same_way
-from edgeslam_torch.types import IntArray, Kernel
+from edgeslam_torch.types import IntArray
 
 UNKNOWN_SCALE_LOG = 1.0
 """Standard deviation of the log of the metres per map unit where nothing but the window's own telemetry tells them."""

@@ -19,7 +19,7 @@ from edgeslam_torch.mapping.window_terms import (
     make_structure,
 )
 from edgeslam_torch.optim.problem import WindowProblem
-from edgeslam_torch.types import CycleForm, FloatArray
+from edgeslam_torch.types import FloatArray
 
 FEW_ANCHORS = 100
 """Anchors of a keyframe below which edges join its window: as many as start a map, and as tracking's threshold."""
@@ -137,7 +137,7 @@ def term_config(config: WindowConfig) -> TermConfig:
         edges_per_pose=config.edges_per_keyframe,
         targets=config.targets,
         edge_sigma_px=default.edge_sigma_px if config.alignment else 0.0,
-        cycle=CycleForm.PIXEL if config.cycle == "literal" else CycleForm.RELATIVE_DEPTH,
+        cycle_px=config.cycle == "literal",
         cycle_sigma=cycle_sigma,
         collinearity=config.collinearity,
         # The literal angle's residual is identically zero: omitting it is equivalent.

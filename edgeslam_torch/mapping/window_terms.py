@@ -11,7 +11,7 @@ from edgeslam_torch.frontend.corners import Junctions, detect_junctions
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.optim.edge_association import EdgeField, associate_edges, edge_field, nearest_edges
 from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms
-from edgeslam_torch.types import CycleForm, Edges, FloatArray, IntArray
+from edgeslam_torch.types import Edges, FloatArray, IntArray
 
 UNKNOWN_SIGMA_LOG = 0.35
 """Relative sigma of a corner's depths without a measurement."""
@@ -44,7 +44,8 @@ class TermConfig:
     alignment."""
     least_sigma: float = 0.003
     """Minimum relative depth sigma of an edge."""
-    cycle: CycleForm = CycleForm.RELATIVE_DEPTH
+    cycle_px: bool = False
+    """The cycle in pixels instead of by relative depth."""
     cycle_sigma: float = 0.02
     """Standard deviation of the cycle residual; zero disables the cycle."""
     junction_px: float = 6.0
@@ -156,7 +157,7 @@ def edge_terms(
         pair_normal=pairs.pair_normal,
         pair_inv_sigma=np.full(len(pair_edge), alignment),
         pair_inverse_depth=pairs.pair_inverse_depth,
-        cycle=config.cycle,
+        cycle_px=config.cycle_px,
         cycle_sigma=config.cycle_sigma,
     )
     return PlacedEdges(terms, np.concatenate(chosen)[used])

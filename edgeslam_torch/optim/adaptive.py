@@ -9,9 +9,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgeslam_torch.geometry.robust_statistics import robust_sigma
+from edgeslam_torch.optim.blocks import Blocks, Normal
 from edgeslam_torch.optim.problem import LmConfig, WindowProblem
 from edgeslam_torch.optim.window import Window
-from edgeslam_torch.types import CycleForm, FloatArray
+from edgeslam_torch.types import FloatArray
 
 SMALLEST_SIGMA = 1e-9
 """Below this a term's residuals are rounding errors, and its weight would be meaningless."""
@@ -79,7 +80,7 @@ def term_residuals(problem: WindowProblem) -> dict[str, FloatArray]:
         camera are omitted.
     """
     window = Window(_unit(problem), LmConfig())
-    normals = dict(zip(window.blocks, window.linearise(window.start).blocks, strict=True))
+    normals: dict[Blocks, Normal] = dict(zip(window.blocks, window.linearise(window.start).blocks, strict=True))
     out = {}
     anchors = normals[window.anchors]
     if anchors.front.any():
@@ -91,8 +92,7 @@ def term_residuals(problem: WindowProblem) -> dict[str, FloatArray]:
             out["edge"] = r[used, :1]
         used = front & (problem.edges.pair_inverse_depth > 0)
         if used.any() and problem.edges.cycle_sigma > 0:
-            relative = problem.edges.cycle is CycleForm.RELATIVE_DEPTH
-            out["cycle" if relative else "cycle px"] = r[used, 1:]
+            out["cycle px" if problem.edges.cycle_px else "cycle"] = r[used, 1:]
     if window.junctions is not None and problem.junctions is not None:
         r = normals[window.junctions].r[normals[window.junctions].front]
         if problem.junctions.inv_sigma_px > 0:
@@ -148,7 +148,7 @@ def with_scales(problem: WindowProblem, scales: AdaptiveScales, alike: float = 1
     problem = replace(problem, inv_sigma=problem.inv_sigma / sigma["reproj"])
     edges, junctions = problem.edges, problem.junctions
     if edges is not None:
-        name = "cycle" if edges.cycle is CycleForm.RELATIVE_DEPTH else "edge"
+        name = "edge" if edges.cycle_px else "cycle"
         edges = replace(
             edges,
             pair_inv_sigma=np.where(edges.pair_inv_sigma > 0, 1.0 / (alike * sigma["edge"]), 0.0),

@@ -5,20 +5,25 @@ target; the adjoint carries them to the two poses: ``xi_relative = xi_target - A
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.robust_statistics import Kernel
 from edgeslam_torch.optim.kernels import edges as edge_kernel
 from edgeslam_torch.optim.kernels.normal_equations import accumulate, coupled
 from edgeslam_torch.optim.problem import DepthPriors, EdgeTerms, JunctionTerms, LmConfig, Rows, WindowProblem
-from edgeslam_torch.types import BoolArray, CycleForm, FloatArray, IntArray, Kernel
+from edgeslam_torch.types import FloatArray, IntArray
 
+Value = TypeVar("Value", bound=np.generic)
 INVERSE_DEPTH_MIN = 1e-4
 """Lower bound of refined inverse depths: practically at infinity, never behind the camera [1/map unit]."""
+LEAST_SHRINKAGE = 0.1
+"""Lower bound of an anchor's inverse distance after a step, of that before."""
+_TINY = 1e-12
 _NO_PRIORS = DepthPriors(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
-_CYCLE = {CycleForm.RELATIVE_DEPTH: edge_kernel.RELATIVE_DEPTH, CycleForm.PIXEL: edge_kernel.PIXEL}
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +39,7 @@ class Normal:
     cost: float
     r: FloatArray
     """Whitened residuals in the caller's order ``(n, k)``; depth priors not among them."""
-    front: BoolArray
+    front: NDArray[np.bool_]
     """``(n,)`` which lie in front of the camera."""
 
 
@@ -58,8 +63,8 @@ class Blocks(Protocol):
     def normal(self, T_c_w: FloatArray, x: FloatArray, H: FloatArray, g: FloatArray) -> Normal:
         """Normal equations at poses and blocks; the poses' part is added to ``H (6 F, 6 F)`` and ``g (6 F,)``."""
 
-    def moved(self, x: FloatArray, step: FloatArray) -> FloatArray:
-        """The blocks after a step, both ``(B, m)``."""
+    def moved(self, T_c_w: FloatArray, x: FloatArray, step: FloatArray) -> FloatArray:
+        """The blocks after a step, both ``(B, m)``, from poses ``(W, 4, 4)``."""
 
 
 class Anchors:
@@ -67,15 +72,17 @@ class Anchors:
 
     def __init__(self, problem: WindowProblem, column: IntArray, config: LmConfig, rows: Rows) -> None:
         """Lay out; ``column (W,)`` is the free-pose number of each pose, -1 for a fixed one."""
-        self.config, self.rows, self.K = config, rows, problem.K
+        self.config, self.rows, self.K = config, rows, tuple(float(k) for k in problem.K)
         self.free = int((column >= 0).sum())
-        self.x = np.array(problem.p_w, dtype=np.float64).reshape(-1, 3)
+        self.x: FloatArray = np.array(problem.p_w, dtype=np.float64).reshape(-1, 3)
         known = problem.depth_priors or _NO_PRIORS
         self.order = np.argsort(problem.obs_anchor, kind="stable")
         self.seen = _Seen(problem.obs_pose, problem.obs_anchor, problem.inv_sigma, column, self.order)
         self.known = _Seen(known.pose, known.anchor, 1.0 / np.asarray(known.sigma), column, slice(None))
         self.uv = _floats(problem.uv).reshape(-1, 2)[self.order]
         self.prior = _floats(known.inverse_depth)
+        self.host = np.zeros(len(self.x), dtype=np.int64)
+        self.host[self.seen.anchor[::-1]] = self.seen.pose[::-1]
         self.links, slots = linked(
             np.concatenate((self.seen.anchor, self.known.anchor)),
             np.concatenate((self.seen.column, self.known.column)),
@@ -102,9 +109,15 @@ class Anchors:
         add_blocks(H, poses, poses, own)
         return Normal(V, g_x, W, cost, _unsorted(r, self.order), _unsorted(front, self.order))
 
-    def moved(self, x: FloatArray, step: FloatArray) -> FloatArray:
-        """See `Blocks`."""
-        return x + step
+    def moved(self, T_c_w: FloatArray, x: FloatArray, step: FloatArray) -> FloatArray:
+        """See `Blocks`; a step is linear in the inverse depth from the first camera that sees the anchor.
+
+        With the point at distance d from that camera, and the step's part a d along the ray, the inverse distance
+        becomes (1 - a) / d. Linear steps of points would overshoot where there is little parallax.
+        """
+        ray = x - se3.inverse(T_c_w)[self.host, :3, 3]
+        along = (step * ray).sum(1) / np.maximum((ray * ray).sum(1), _TINY)
+        return x + step / np.maximum(1.0 - along, LEAST_SHRINKAGE)[:, None]
 
 
 class _Seen:
@@ -146,7 +159,7 @@ class Hosted:
             ValueError: If a pair's target is its host.
         """
         self.config = config
-        self.x = np.maximum(_floats(inverse_depth), INVERSE_DEPTH_MIN)
+        self.x: FloatArray = np.maximum(_floats(inverse_depth), INVERSE_DEPTH_MIN)
         self.prior, self.information = (_floats(p) for p in prior)
         host, pose = _indices(host), _indices(pair_pose)
         self.order = np.argsort(pair_block, kind="stable")
@@ -166,7 +179,7 @@ class Hosted:
         self.pairs = np.arange(len(pose))
         self.far = np.full(len(pose), config.behind_px**2)
 
-    def residuals(self, T_j_i: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def residuals(self, T_j_i: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """Residuals of the pairs ``(P, k)``, derivatives ``(P, k, 6 + m)`` and which lie in front ``(P,)``."""
         raise NotImplementedError
 
@@ -197,7 +210,7 @@ class Hosted:
         np.add.at(g, host[host >= 0], -(g_view[:, None] @ Ad)[host >= 0, 0])
         return Normal(V, g_x, W, cost, _unsorted(r, self.order), _unsorted(front, self.order))
 
-    def moved(self, x: FloatArray, step: FloatArray) -> FloatArray:
+    def moved(self, T_c_w: FloatArray, x: FloatArray, step: FloatArray) -> FloatArray:
         """See `Blocks`."""
         return np.maximum(x + step, INVERSE_DEPTH_MIN)
 
@@ -214,15 +227,16 @@ class Edges(Hosted):
         prior = np.where(known, terms.prior, 0.0)[:, None], np.where(known, sigma, np.inf)[:, None, None] ** -2.0
         start = _floats(terms.inverse_depth)[:, None]
         super().__init__(terms.host, terms.pair_edge, terms.pair_pose, start, prior, column, config)
-        self.rows, self.K = rows, problem.K
+        self.rows, self.K = rows, tuple(float(k) for k in problem.K)
         self.uv = _floats(terms.uv).reshape(-1, 2)
         self.uv_j, self.normal_j = (_floats(x).reshape(-1, 2)[self.order] for x in (terms.pair_uv, terms.pair_normal))
         self.inv_sigma = _floats(terms.pair_inv_sigma)[self.order]
         self.held = _floats(terms.pair_inverse_depth)[self.order]
         has_cycle = terms.cycle_sigma > 0 and bool((self.held > 0).any())
-        self.cycle = (_CYCLE[terms.cycle], 1.0 / terms.cycle_sigma) if has_cycle else (edge_kernel.NONE, 0.0)
+        form = edge_kernel.PIXEL if terms.cycle_px else edge_kernel.RELATIVE_DEPTH
+        self.cycle = (form, 1.0 / terms.cycle_sigma) if has_cycle else (edge_kernel.NONE, 0.0)
 
-    def residuals(self, T_j_i: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def residuals(self, T_j_i: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """See `Hosted`."""
         partner = self.uv_j, self.normal_j, self.inv_sigma, self.held
         depth = np.ascontiguousarray(x[:, 0])
@@ -239,13 +253,13 @@ class Junctions(Hosted):
         start, prior = (_floats(x).reshape(-1, 3) for x in (terms.inverse_depth, terms.prior))
         known = prior, _floats(terms.prior_information).reshape(-1, 3, 3)
         super().__init__(terms.host, terms.pair_junction, terms.pair_pose, start, known, column, config)
-        self.rows, self.K = rows, problem.K
+        self.rows, self.K = rows, tuple(float(k) for k in problem.K)
         self.uv = _floats(terms.uv).reshape(-1, 3, 2)
         self.uv_j = _floats(terms.pair_uv).reshape(-1, 2)[self.order]
         self.arms_j = _floats(terms.pair_arms).reshape(-1, 2, 2)[self.order]
         self.form = float(terms.inv_sigma_px), float(terms.inv_sigma_angle), bool(terms.cosines)
 
-    def residuals(self, T_j_i: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def residuals(self, T_j_i: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """See `Hosted`."""
         return self.rows.junctions(T_j_i, self.view, self.block, self.uv, x, self.uv_j, self.arms_j, *self.form, self.K)
 
@@ -281,7 +295,7 @@ def kernel_number(kernel: Kernel) -> int:
     return list(Kernel).index(kernel)
 
 
-def _unsorted(values: FloatArray, order: IntArray) -> FloatArray:
+def _unsorted(values: NDArray[Value], order: IntArray) -> NDArray[Value]:
     out = np.empty_like(values)
     out[order] = values
     return out

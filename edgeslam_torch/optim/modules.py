@@ -8,18 +8,19 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from edgeslam_torch.geometry import se3_torch as lie
 from edgeslam_torch.losses.base import Residuals, move
-from edgeslam_torch.losses.cycle import CycleLoss
+from edgeslam_torch.losses.cycle import CycleForm, CycleLoss
 from edgeslam_torch.losses.edge_alignment import EdgeAlignmentLoss
 from edgeslam_torch.losses.lshape import junction_residuals
 from edgeslam_torch.losses.reprojection import ReprojectionLoss
 from edgeslam_torch.optim.kernels.edges import PIXEL, RELATIVE_DEPTH
-from edgeslam_torch.types import BoolArray, CycleForm, FloatArray, IntArray
+from edgeslam_torch.types import FloatArray, IntArray
 
-Rows = tuple[FloatArray, FloatArray, BoolArray]
+Rows = tuple[FloatArray, FloatArray, NDArray[np.bool_]]
 Intrinsics = tuple[float, float, float, float]
 _FORMS = {RELATIVE_DEPTH: CycleForm.RELATIVE_DEPTH, PIXEL: CycleForm.PIXEL}
 

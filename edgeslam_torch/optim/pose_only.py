@@ -1,13 +1,14 @@
-"""Robust refinement of one camera pose against fixed points; runs once or twice per frame, so numpy."""
+"""Robust refinement of one camera pose against fixed points."""
 
-import math
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
+from edgeslam_torch.optim.kernels.pose import pose_equations
 from edgeslam_torch.optim.priors import inverse_left_jacobian, pose_prior_residual
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray
@@ -99,7 +100,7 @@ def refine_pose(
         ('ok', True)
     """
     config = config or PoseConfig()
-    start: FloatArray = np.array(T_c_w, dtype=np.float64)
+    start: FloatArray = np.array(T_c_w, dtype=np.float64, order="C")
     points = _Points(p_w, uv, inv_sigma, K, slack_px, prior, config)
     n = len(points.use)
     if n < config.min_points:
@@ -159,7 +160,7 @@ def _round(T: FloatArray, points: "_Points", robust: bool, config: PoseConfig) -
             delta = -np.linalg.solve(damped, g)
         except np.linalg.LinAlgError:
             return T, used, False
-        trial = _exp(delta) @ T
+        trial = se3.exp(delta) @ T
         if float(-g @ delta) <= config.cost_tolerance * cost:
             return trial, used, True
         chi2 = points.chi2
@@ -178,57 +179,8 @@ def _round(T: FloatArray, points: "_Points", robust: bool, config: PoseConfig) -
     return T, used, False
 
 
-def _exp(xi: FloatArray) -> FloatArray:
-    """`se3.exp` of one small tangent in scalars: a fifth of the time, and it runs a dozen times per frame.
-
-    Apart also because the two round differently, and hololens_a's error moves between .2 and .55 m by rounding alone.
-    """
-    a, b, c, x, y, z = xi.tolist()
-    theta2 = x * x + y * y + z * z
-    if theta2 < 1e-8:
-        s, k, m = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
-    else:
-        theta = math.sqrt(theta2)
-        s = math.sin(theta) / theta
-        k = (1.0 - math.cos(theta)) / theta2
-        m = (1.0 - s) / theta2
-    u, v, w = y * c - z * b, z * a - x * c, x * b - y * a  # phi x rho
-    return np.array(
-        (
-            (
-                1.0 - k * (y * y + z * z),
-                k * x * y - s * z,
-                k * x * z + s * y,
-                a + k * u + m * (y * w - z * v),
-            ),
-            (
-                k * x * y + s * z,
-                1.0 - k * (x * x + z * z),
-                k * y * z - s * x,
-                b + k * v + m * (z * u - x * w),
-            ),
-            (
-                k * x * z - s * y,
-                k * y * z + s * x,
-                1.0 - k * (x * x + y * y),
-                c + k * w + m * (x * v - y * u),
-            ),
-            (0.0, 0.0, 0.0, 1.0),
-        )
-    )
-
-
-def _slack(slack_px: FloatArray, inv_sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit directions ``(2, N)``, and the same scaled by the share of the residual along them that an uncertain depth
-    explains."""
-    s = np.asarray(slack_px, dtype=np.float64).reshape(-1, 2).T * inv_sigma
-    length2 = (s * s).sum(0)
-    along = s / np.sqrt(np.maximum(length2, 1e-30))
-    return along, along * (1.0 - 1.0 / np.sqrt(1.0 + length2))
-
-
 class _Points:
-    """Points of one refinement and the scratch rows of their Jacobian."""
+    """Points of one refinement."""
 
     def __init__(
         self,
@@ -240,82 +192,37 @@ class _Points:
         prior: PosePrior | None,
         config: PoseConfig,
     ) -> None:
-        fx, fy, cx, cy = K
-        self.p = np.ascontiguousarray(np.asarray(p_w, dtype=np.float64).reshape(-1, 3).T)
-        uv64 = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
-        n = len(uv64)
-        if self.p.shape[1] != n or len(inv_sigma) != n:
-            raise ValueError(f"{self.p.shape[1]} points, {n} pixels and {len(inv_sigma)} sigmas must be equally many")
-        # In normalised coordinates the Jacobian is free of intrinsics, which go into the weights.
-        self.xy = np.stack(((uv64[:, 0] - cx) / fx, (uv64[:, 1] - cy) / fy))
-        self.weight = np.array([[fx], [fy]]) * np.asarray(inv_sigma, dtype=np.float64)
-        self.slack = None if slack_px is None else _slack(slack_px, inv_sigma)
+        self.p_w, self.uv = _floats(p_w).reshape(-1, 3), _floats(uv).reshape(-1, 2)
+        self.inv_sigma, (fx, fy, cx, cy) = _floats(inv_sigma), (float(k) for k in K)
+        self.K = fx, fy, cx, cy
+        n = len(self.uv)
+        if len(self.p_w) != n or len(self.inv_sigma) != n:
+            raise ValueError(f"{len(self.p_w)} points, {n} pixels and {len(inv_sigma)} sigmas must be equally many")
+        self.slack = np.zeros((n, 2)) if slack_px is None else _floats(slack_px).reshape(-1, 2)
         self.prior, self.config = prior, config
         self.use = np.ones(n, dtype=bool)
         self.chi2 = np.full(n, np.inf)
-        self.rows = np.zeros((7, 2, n))
 
     def finite(self) -> bool:
         """Whether every input is finite."""
-        return bool(np.isfinite(self.p).all() and np.isfinite(self.xy).all() and np.isfinite(self.weight).all())
-
-    def _relaxed(self, rows: FloatArray) -> FloatArray:
-        """Rows ``(..., 2, N)`` whitened by the keypoints' sigma and by each point's slack."""
-        if self.slack is None:
-            return rows
-        along, weaken = self.slack
-        return rows - (rows * along).sum(-2, keepdims=True) * weaken
+        return all(bool(np.isfinite(x).all()) for x in (self.p_w, self.uv, self.inv_sigma))
 
     def linearise(self, T: FloatArray, robust: bool) -> tuple[FloatArray | None, FloatArray, float]:
         """Normal matrix, gradient and cost over the points in use; sets ``chi2`` of all points."""
-        p_c = T[:3, :3] @ self.p + T[:3, 3:]
-        z = p_c[2]
-        use, behind = self.use, 0.0
-        hidden = z <= self.config.min_depth
-        some_hidden = bool(hidden.any())
-        if some_hidden:
-            z = np.where(hidden, 1.0, z)
-            behind = float(np.count_nonzero(use & hidden))
-            use = use & ~hidden
-        iz = 1.0 / z
-        n = p_c[:2] * iz
-        x, y = n
-        r = n - self.xy
-        s = np.square(self._relaxed(r * self.weight)).sum(0)
-        self.chi2 = np.where(hidden, np.inf, s) if some_hidden else s
-        if robust:
-            chi2 = self.config.chi2
-            delta = math.sqrt(chi2)
-            norm = np.sqrt(np.maximum(s, chi2))
-            # s inside, 2 delta |r| - delta^2 outside; its derivative is delta / norm
-            cost = np.minimum(s, chi2) + 2.0 * delta * norm
-            # A point behind the camera costs as much as an error of a thousand pixels.
-            total: float = float(cost @ use) - 2.0 * chi2 * np.count_nonzero(use) + 2000.0 * delta * behind
-            weight = self.weight * (np.sqrt(delta / norm) * use)
-        else:
-            weight = self.weight * use
-            total = float(s @ use) + 1e6 * behind
-        rows = self.rows
-        xy = x * y
-        rows[0, 0] = rows[1, 1] = iz
-        np.multiply(n, -iz, out=rows[2])
-        np.negative(xy, out=rows[3, 0])
-        np.add(x * x, 1.0, out=rows[4, 0])
-        np.negative(y, out=rows[5, 0])
-        np.subtract(-1.0, y * y, out=rows[3, 1])
-        rows[4, 1], rows[5, 1], rows[6] = xy, x, r
-        B = self._relaxed(rows * weight).reshape(7, -1)
-        G = B @ B.T
-        H, g = G[:6, :6], G[:6, 6].copy()
+        config = self.config
+        points = self.p_w, self.uv, self.inv_sigma, self.slack, self.K, self.use
+        H, g, cost, self.chi2 = pose_equations(T, *points, robust, config.chi2, config.min_depth)
         if self.prior is not None:
             e = pose_prior_residual(T, self.prior)
             J = inverse_left_jacobian(e)
-            H = H + J.T @ self.prior.information @ J
+            H += J.T @ self.prior.information @ J
             g += J.T @ (self.prior.information @ e)
-            total += float(e @ self.prior.information @ e)
-        if not np.isfinite(total):
-            return None, g, total
-        return H, g, total
+            cost += float(e @ self.prior.information @ e)
+        return (H if np.isfinite(cost) else None), g, cost
+
+
+def _floats(x: FloatArray) -> FloatArray:
+    return np.ascontiguousarray(x, dtype=np.float64)
 
 
 _DIAGONAL = np.arange(6)

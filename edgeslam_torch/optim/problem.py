@@ -6,9 +6,10 @@ from enum import StrEnum
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from edgeslam_torch.geometry.robust_statistics import CHI2_1DOF_95, CHI2_2DOF_95
-from edgeslam_torch.types import BoolArray, CycleForm, FloatArray, IntArray, Kernel
+from edgeslam_torch.geometry.robust_statistics import CHI2_1DOF_95, CHI2_2DOF_95, Kernel
+from edgeslam_torch.types import FloatArray, IntArray
 
 
 class StopReason(StrEnum):
@@ -106,14 +107,10 @@ class EdgeTerms:
     """``(P,)`` inverse standard deviation across the edge [1/px]; zero switches alignment off."""
     pair_inverse_depth: FloatArray
     """``(P,)`` inverse depth of the target there, held constant; zero if unknown (no cycle)."""
-    cycle: CycleForm = CycleForm.RELATIVE_DEPTH
-    """Form of the cycle residual; ``PARALLAX`` is for training only."""
+    cycle_px: bool = False
+    """The cycle in pixels, as the paper has it, instead of by relative depth."""
     cycle_sigma: float = 0.0
-    """Its standard deviation in its own unit; zero switches the cycle off."""
-
-    def __post_init__(self) -> None:
-        if self.cycle is CycleForm.PARALLAX:
-            raise ValueError("the solver knows the cycle as pixels or as relative depth, not as parallax")
+    """Standard deviation of the cycle in its own unit; zero switches it off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +195,7 @@ class WindowProblem:
 
     T_c_w: FloatArray
     """``(W, 4, 4)`` world-to-camera poses."""
-    pose_fixed: BoolArray
+    pose_fixed: NDArray[np.bool_]
     """``(W,)`` poses that hold the gauge and do not move."""
     p_w: FloatArray
     """``(A, 3)`` anchors in the world."""
@@ -274,7 +271,7 @@ class WindowResult:
     """``(A, 3)`` refined anchors."""
     chi2: FloatArray
     """``(M,)`` squared whitened reprojection residuals at the result; infinite behind the camera."""
-    in_front: BoolArray
+    in_front: NDArray[np.bool_]
     """``(M,)`` whether the anchor lies in front of the camera."""
     cost_before: float
     """Robust cost (sum of rho) at the start."""

@@ -56,7 +56,8 @@ class Window:
         rows = _modules() if config.solver == "modules" else compiled
         self.anchors = Anchors(problem, column, config, rows)
         self.blocks: list[Blocks] = [self.anchors]
-        self.edges = self.junctions = None
+        self.edges: Edges | None = None
+        self.junctions: Junctions | None = None
         if problem.edges is not None and len(problem.edges.host):
             self.edges = Edges(problem, problem.edges, column, config, rows)
             self.blocks.append(self.edges)
@@ -96,7 +97,7 @@ class Window:
             step = back_substitute(factor, normal.g, normal.W, block.links.start, block.links.column, poses)
             predicted += _promise(mu, _diagonal(normal), normal.g, step)
             size = max(size, _largest(step))
-            x.append(block.moved(was, step))
+            x.append(block.moved(system.state.T_c_w, was, step))
         T = system.state.T_c_w.copy()
         for i, xi in zip(self.free, poses, strict=True):
             T[i] = se3.exp(xi) @ T[i]
@@ -105,8 +106,8 @@ class Window:
     def refine(self) -> WindowResult:
         """Run the loop and report."""
         system, summary = minimise(self, self.start, self.config)
-        normal = dict(zip(self.blocks, system.blocks, strict=True))
-        x = dict(zip(self.blocks, system.state.x, strict=True))
+        normal: dict[Blocks, Normal] = dict(zip(self.blocks, system.blocks, strict=True))
+        x: dict[Blocks, FloatArray] = dict(zip(self.blocks, system.state.x, strict=True))
         anchors = normal[self.anchors]
         deficiency, covariance = -1, np.full((6, 6), np.nan)
         if self.config.diagnostics and summary.stop is not StopReason.NOT_FINITE and len(self.free):

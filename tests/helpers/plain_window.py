@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from edgeslam_torch.geometry import se3_torch
-from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.robust import rho
 from edgeslam_torch.optim.problem import LmConfig, WindowProblem
 
@@ -149,7 +148,7 @@ def _edge_terms(problem, config, poses, in_camera, pixel) -> list[Term]:  # type
 
     terms: list[Term] = [(alignment, config.edge_delta), (prior, None)]
     if e.cycle_sigma > 0:
-        form = relative_depth if e.cycle is CycleForm.RELATIVE_DEPTH else round_trip
+        form = round_trip if e.cycle_px else relative_depth
         terms.append((form, config.edge_delta))
     return terms
 

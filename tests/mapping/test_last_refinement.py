@@ -11,6 +11,7 @@ from rendered import CAMERA, film, sideways, stairs_world
 from edgeslam_torch.config import DepthConfig, SlamConfig, WindowConfig
 from edgeslam_torch.eval.benchmark.ablation import pickled
 from edgeslam_torch.eval.metrics.align import umeyama
+from edgeslam_torch.geometry.robust_statistics import Kernel
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping import refinement
@@ -19,7 +20,6 @@ from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
 from edgeslam_torch.mapping.motion_terms import MotionFactors
 from edgeslam_torch.optim.problem import StopReason, WindowResult
 from edgeslam_torch.slam import EdgeSlam
-from edgeslam_torch.types import Kernel
 
 POINTS = WindowConfig(alignment=False, cycle="off")
 FORMS = {

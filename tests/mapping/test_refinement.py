@@ -6,6 +6,7 @@ from point_map import CAMERA, PointMap, check_map, small_motion
 
 from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.robust_statistics import Kernel
 from edgeslam_torch.mapping.last_refinement import lm_config
 from edgeslam_torch.mapping.refinement import (
     Window,
@@ -18,7 +19,6 @@ from edgeslam_torch.mapping.refinement import (
 )
 from edgeslam_torch.optim.pose_only import refine_pose
 from edgeslam_torch.optim.problem import LmConfig, StopReason
-from edgeslam_torch.types import Kernel
 
 
 @pytest.fixture

@@ -16,7 +16,6 @@ from edgeslam_torch.mapping.refinement import choose_window, refine, window_prob
 from edgeslam_torch.mapping.window_edges import FEW_ANCHORS, WindowEdges, term_config
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.slam import EdgeSlam
-from edgeslam_torch.types import CycleForm
 
 ALWAYS = WindowConfig(in_flight="always")
 
@@ -127,7 +126,7 @@ def test_losses_of_the_flying_windows_are_chosen_one_by_one(losses, alignment, c
 def test_forms_chosen_for_the_end_hold_while_flying_and_unknown_losses_are_refused():
     terms = WindowConfig(cycle="literal").flying
     assert terms is not None
-    assert term_config(terms).cycle is CycleForm.PIXEL
+    assert term_config(terms).cycle_px
     assert WindowConfig(in_flight_losses=()).flying is None
     with pytest.raises(ValueError, match="in_flight_losses must be among alignment, cycle, angle, collinearity"):
         WindowConfig(in_flight_losses=("edges",))

@@ -10,7 +10,6 @@ from edgeslam_torch.geometry.robust_statistics import robust_sigma
 from edgeslam_torch.optim.adaptive import AdaptiveScales, TermScale, term_residuals, with_scales
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig
-from edgeslam_torch.types import CycleForm
 
 SMALL = WindowSize(poses=6, fixed=2, anchors=200, observations=800, edges=300, pairs=1200, junctions=40)
 
@@ -82,7 +81,7 @@ def test_a_wrong_sigma_is_corrected_and_improves_the_poses():
 
 def test_the_papers_pixel_cycle_is_measured_in_pixels():
     problem = at_truth(5, Noise(px=0.0, depth=0.1))
-    pixel = replace(problem, edges=replace(problem.edges, cycle=CycleForm.PIXEL))
+    pixel = replace(problem, edges=replace(problem.edges, cycle_px=True))
     found = term_residuals(pixel)
     assert "cycle" not in found
     assert len(found["cycle px"]) > 1000

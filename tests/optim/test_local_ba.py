@@ -15,6 +15,7 @@ from edgeslam_torch.eval.benchmark.windows import (
     seeded_window,
 )
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.robust_statistics import Kernel
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import (
     DepthPriors,
@@ -25,7 +26,6 @@ from edgeslam_torch.optim.problem import (
     WindowProblem,
     WindowResult,
 )
-from edgeslam_torch.types import CycleForm, Kernel
 
 SMALL = WindowSize(poses=6, fixed=2, anchors=150, observations=600, edges=200, pairs=600, junctions=20)
 CLEAN = Noise(px=0.0, depth=0.0)
@@ -216,7 +216,7 @@ def cycle_alone(window: SeededWindow) -> WindowProblem:
         edges,
         pair_inv_sigma=np.zeros(len(edges.pair_edge)),
         prior_sigma=np.full(len(edges.host), np.inf),
-        cycle=CycleForm.PIXEL,
+        cycle_px=True,
         cycle_sigma=1.0,
     )
     return replace(without_points(window.problem), edges=free, junctions=None)
@@ -238,7 +238,7 @@ def test_relative_depth_cycle_does_not_pay_for_shrinking():
     window = seeded_window(11, replace(SMALL, fixed=1, edges=400, pairs=1600))
     edges = cycle_alone(window).edges
     assert edges is not None
-    edges = replace(edges, cycle=CycleForm.RELATIVE_DEPTH, cycle_sigma=0.05)
+    edges = replace(edges, cycle_px=False, cycle_sigma=0.05)
     result = refine_window(replace(window.problem, edges=edges), replace(TIGHT, max_iterations=100))
     ratio = np.median(baselines(result.T_c_w) / baselines(window.T_c_w))
     assert ratio == pytest.approx(1.0, abs=0.05)

@@ -8,11 +8,11 @@ import torch
 
 from edgeslam_torch.eval.benchmark.windows import Noise, WindowSize, seeded_window
 from edgeslam_torch.losses import AngleLoss, CycleLoss, EdgeAlignmentLoss, ReprojectionLoss
+from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.optim.adaptive import window_losses
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, WindowProblem
 from edgeslam_torch.optim.window import refined
-from edgeslam_torch.types import CycleForm
 
 SMALL = WindowSize(poses=6, fixed=2, anchors=100, observations=400, edges=150, pairs=500, junctions=30)
 FORMS = [CycleForm.RELATIVE_DEPTH, CycleForm.PIXEL]
@@ -27,7 +27,9 @@ def noisy(form: CycleForm) -> WindowProblem:
         problem,
         scale_priors=(),
         inv_sigma=np.ones(len(problem.obs_pose)),
-        edges=replace(edges, cycle=form, cycle_sigma=0.5, prior_sigma=np.full(len(edges.host), np.inf)),
+        edges=replace(
+            edges, cycle_px=form is CycleForm.PIXEL, cycle_sigma=0.5, prior_sigma=np.full(len(edges.host), np.inf)
+        ),
         junctions=replace(
             junctions,
             cosines=True,

@@ -28,7 +28,7 @@ def compiled(function: Function) -> Function:
         return cast(Function, numba.njit(**settings)(function))
 
 
-class _Notice(event.Listener):  # type: ignore[misc]  # numba has no types
+class _Notice(event.Listener):
     """Says once that a first call takes long."""
 
     said = False

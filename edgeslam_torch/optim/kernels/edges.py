@@ -6,9 +6,10 @@ special case. Derivatives are by the left tangent of the relative pose, six numb
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgeslam_torch.optim.kernels.compiled import compiled
-from edgeslam_torch.types import BoolArray, FloatArray, IntArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 MIN_DEPTH = 1e-6
 """A point nearer than this lies behind the camera; of points divided by their depth in the host."""
@@ -30,7 +31,7 @@ def edges(
     cycle: int,
     cycle_inv_sigma: float,
     K: tuple[float, float, float, float],
-) -> tuple[FloatArray, FloatArray, BoolArray]:
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Whitened residuals of pairs of an edge pixel and its partner, their derivatives, and which lie in front.
 
     Args:

@@ -7,9 +7,10 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgeslam_torch.optim.kernels.compiled import compiled
-from edgeslam_torch.types import BoolArray, FloatArray, IntArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 MIN_DEPTH = 1e-6
 """As in `optim.kernels.edges`."""
@@ -30,7 +31,7 @@ def junctions(
     inv_sigma_angle: float,
     cosines: bool,
     K: tuple[float, float, float, float],
-) -> tuple[FloatArray, FloatArray, BoolArray]:
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Whitened residuals of junctions, their derivatives, and which lie in front.
 
     Args:

@@ -11,9 +11,10 @@ V consists of one small matrix a block, so that the poses' steps follow from :ma
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgeslam_torch.optim.kernels.compiled import compiled
-from edgeslam_torch.types import BoolArray, FloatArray, IntArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 L2, HUBER, CAUCHY, TUKEY = range(4)
 """Robust kernels, in the order of `losses.robust.Kernel`."""
@@ -40,7 +41,7 @@ def rho(s: float, kernel: int, delta: float) -> tuple[float, float]:
 def accumulate(
     r: FloatArray,
     J: FloatArray,
-    front: BoolArray,
+    front: NDArray[np.bool_],
     far: FloatArray,
     joint: bool,
     kernel: int,

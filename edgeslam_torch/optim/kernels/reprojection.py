@@ -5,9 +5,10 @@ With the point :math:`P = R p + t` in the camera, its normalised coordinates :ma
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgeslam_torch.optim.kernels.compiled import compiled
-from edgeslam_torch.types import BoolArray, FloatArray, IntArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 MIN_DEPTH = 1e-6
 """A point nearer than this lies behind the camera [map units]."""
@@ -22,7 +23,7 @@ def reprojection(
     uv: FloatArray,
     inv_sigma: FloatArray,
     K: tuple[float, float, float, float],
-) -> tuple[FloatArray, FloatArray, BoolArray]:
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Whitened residuals of observations, their derivatives, and which lie in front of the camera.
 
     Args:
@@ -65,7 +66,7 @@ def reprojection(
 @compiled
 def inverse_depth(
     T_c_w: FloatArray, p_w: FloatArray, pose: IntArray, anchor: IntArray, prior: FloatArray, inv_sigma: FloatArray
-) -> tuple[FloatArray, FloatArray, BoolArray]:
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Whitened inverse depth minus what is expected of it; arguments and results as `reprojection`, one row each.
 
     Args:

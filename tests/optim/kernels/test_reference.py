@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from edgeslam_torch.eval.benchmark.windows import WindowSize, seeded_window
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.robust_statistics import Kernel
+from edgeslam_torch.optim.blocks import Anchors
 from edgeslam_torch.optim.problem import DepthPriors, LmConfig, WindowProblem
 from edgeslam_torch.optim.window import State, System, Window
-from edgeslam_torch.types import CycleForm, Kernel
 
 EXACT = LmConfig(behind_px=1e6)
 MU = 1e-3
@@ -49,18 +51,19 @@ CASES = {
     "many poses": (LONG, {}, {}),
     "least squares": (SMALL, {"kernel": Kernel.L2}, {}),
     "Cauchy": (SMALL, {"kernel": Kernel.CAUCHY}, {}),
-    "cycle in pixels": (SMALL, {}, {"cycle": CycleForm.PIXEL}),
+    "cycle in pixels": (SMALL, {}, {"cycle_px": True}),
     "cosines": (SMALL, {}, {"cosines": True}),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("solver", ["compiled", "modules"])
-def test_window_is_the_dense_one(case, solver):
+def test_window_is_the_dense_one(case, solver, monkeypatch):
+    monkeypatch.setattr(Anchors, "moved", lambda self, T_c_w, x, step: x + step)
     size, settings, changes = CASES[case]
     config, problem = replace(EXACT, solver=solver, **settings), window(3, size)
-    if "cycle" in changes:
-        problem = replace(problem, edges=replace(problem.edges, cycle=changes["cycle"], cycle_sigma=0.7))
+    if "cycle_px" in changes:
+        problem = replace(problem, edges=replace(problem.edges, cycle_px=True, cycle_sigma=0.7))
     if "cosines" in changes:
         problem = replace(problem, junctions=replace(problem.junctions, cosines=True))
     if "twice" in changes:
@@ -84,3 +87,14 @@ def test_window_is_the_dense_one(case, solver):
     torch.testing.assert_close(moved(refinement, step.state), expected[poses:], rtol=1e-6, atol=1e-8)
     promised = expected @ (MU * plain.H.diagonal() * expected - plain.g)
     assert step.predicted == pytest.approx(float(promised), rel=1e-6)
+
+
+def test_an_anchors_step_is_linear_in_the_inverse_distance_from_its_first_camera():
+    """A step by half the distance doubles it, one towards the camera never passes it."""
+    problem = window(3, replace(SMALL, edges=0, pairs=0, junctions=0))
+    anchors = Window(problem, EXACT).anchors
+    centre = se3.inverse(problem.T_c_w)[anchors.host, :3, 3]
+    ray = anchors.x - centre
+    for part, distance in ((0.5, 2.0), (-1.0, 0.5), (-9.0, 0.1)):
+        moved = anchors.moved(problem.T_c_w, anchors.x, part * ray)
+        np.testing.assert_allclose(moved - centre, distance * ray, rtol=1e-12)

@@ -1,0 +1,49 @@
+"""Compiled loops: with a cache, without one, by two processes at once."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numba
+import pytest
+
+from edgeslam_torch.optim.kernels import compiled as module
+
+KERNELS = Path(module.__file__).parent
+RHO = "from edgeslam_torch.optim.kernels.normal_equations import rho; print(rho(16.0, 1, 2.0))"
+
+
+def test_without_a_place_for_a_cache_every_process_compiles(monkeypatch):
+    def njit(cache=False, **settings):
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        return numba.njit(**settings)
+
+    monkeypatch.setattr(module, "numba", SimpleNamespace(njit=njit))
+    assert module.compiled(lambda x: 2.0 * x)(1.5) == 3.0
+
+
+@pytest.mark.slow
+def test_two_processes_at_once_share_a_cache(tmp_path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", RHO]
+    both = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    assert [p.communicate()[0] for p in both] == ["(12.0, 0.5)\n"] * 2
+    assert list(tmp_path.rglob("*.nbi"))
+    again = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert again.stdout == "(12.0, 0.5)\n"
+    assert "compiling" not in again.stderr
+
+
+@pytest.mark.parametrize("path", sorted(KERNELS.glob("*.py")), ids=lambda path: path.stem)
+def test_a_compiled_function_calls_only_those_of_its_own_file(path):
+    """The cache does not notice changes of other files."""
+    if path.stem == "rows":  # names alone
+        return
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    names = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
+    kernels = {name for name in names if name.startswith("edgeslam_torch.optim.kernels")}
+    assert kernels <= {"edgeslam_torch.optim.kernels.compiled"}
