@@ -354,10 +354,10 @@ def test_an_attitude_that_comes_in_flight_and_has_proven_nothing_does_not_turn_t
     slam.finish()
     for T_w_c in (output.T_w_c, *slam.trajectory()[1]):
         assert T_w_c[2, 0] == pytest.approx(0.0, abs=0.03), "the camera's x axis is level"
-    said = [warning for warning in slam.warnings() if "where up is" in warning]
+    said = [warning for warning in slam.warnings() if "gravity is unknown" in warning]
     assert slam.up is not None and slam.up.source == "edges" and said == [], "edges tell where up is"
     slam.up = None
-    (said,) = [warning for warning in slam.warnings() if "where up is" in warning]
+    (said,) = [warning for warning in slam.warnings() if "gravity is unknown" in warning]
     assert "2.8 s after the first picture" in said
 
 
