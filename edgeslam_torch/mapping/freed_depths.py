@@ -1,15 +1,15 @@
-r"""Correction of the bias of a window's cost by free depths: a rotating camera must not appear to move.
+r"""Correction of the cost's bias towards translation by free depths: a rotating camera must not appear to move.
 
-Refinement minimises over poses *and* depths. While depths rest on priors, its minimum is biased: from a shifted camera
-every depth can follow its pixel's noise, from a turned one none can. So it lies at a baseline at which one sigma of
-depth moves a point by about a pixel, some centimetres in a room, although the camera never moved. The cost is expected
-to be lower by the number of depths that the images determine there (the effective number of parameters, as of a ridge
+Refinement minimises over poses *and* depths. While depths rest on priors, its minimum is biased: under translation
+every depth can fit its pixel's noise, under pure rotation none can. The minimum lies at a baseline at which one sigma
+of depth moves a point by about a pixel, some centimetres in a room, although the camera never moved. The expected cost
+is lower by the number of depths that the images determine there (the effective number of parameters, as of a ridge
 regression),
 
 .. math:: \sum_a \frac{I_a \sigma_a^2}{1 + I_a \sigma_a^2}
 
 where the images have the information ``I_a`` on the anchor's inverse depth, whose prior has the standard deviation
-``sigma_a``. Added to the cost, the sum undoes the bias; it is constant where images tell the depths. ``I_a`` is a
+``sigma_a``. Added to the cost, the sum removes the bias; it is constant where images determine the depths. ``I_a`` is a
 quadratic form of the motions from the anchor's host to its observers, and the summand's tangent in ``I_a`` bounds it
 from above: a prior on each of these motions, as in iteratively reweighted least squares. Far from the minimum that
 tangent is flat. The steeper ``\log(1 + I_a \sigma_a^2)``, the price of marginalised depths, leads there first; alone
@@ -34,15 +34,15 @@ class Weight(IntEnum):
     NONE = 0
     """No term."""
     WIDE = 1
-    """Of the logarithm, which leads to the minimum."""
+    """Of the logarithm, which has the wider basin of convergence."""
     EXACT = 2
     """Of the number of determined depths."""
 
 
 def motion_priors(problem: WindowProblem, weight: Weight) -> tuple[RelativePosePrior, ...]:
-    """Priors on the motions between hosts and observers of a window's anchors on priors, at the present poses.
+    """Priors on the motions between hosts and observers of a window's anchors with depth priors, at the current poses.
 
-    Their mean is no translation; rotations are free.
+    Their mean is zero translation; rotations are free.
     """
     priors = problem.depth_priors
     if priors is None or weight is Weight.NONE:

@@ -12,7 +12,7 @@ from edgeslam_torch.types import FloatArray, IntArray
 RADIUS_PX = 3.0
 """Search radius at pyramid level 0; poses and points are refined already."""
 MAX_HAMMING = 50
-"""Bits, of 256; the strict figure of ORB-SLAM2, as there is no ratio test."""
+"""Maximum Hamming distance [bits of 256]; the strict threshold of ORB-SLAM2, as there is no ratio test."""
 YOUNG = 3
 """Number of keyframes during which a new anchor is searched in its neighbours."""
 
@@ -80,8 +80,8 @@ def look_for(
 
 
 def observe_or_pair(slam_map: SlamMap, keyframe: Keyframe, found: IntArray, keypoint: IntArray) -> Pairs:
-    """Observe anchors ``(M,)`` on a keyframe's free keypoints; returns the others with the anchors of their
-    keypoints."""
+    """Observe anchors ``(M,)`` on a keyframe's free keypoints; returns the others paired with the anchors that occupy
+    their keypoints."""
     observed = keyframe.anchor[keypoint]
     free = observed < 0
     slam_map.observe(keyframe, keypoint[free], found[free])
@@ -104,7 +104,7 @@ def merge(slam_map: SlamMap, doubles: list[Pairs]) -> None:
     a, b = (np.concatenate(side) for side in zip(*doubles, strict=True))
     keep_a = slam_map.anchors.observations[a] >= slam_map.anchors.observations[b]
     winners, losers = np.where(keep_a, a, b), np.where(keep_a, b, a)
-    # One id may sit in several pairs; only disjoint pairs are merged now, the rest at a later keyframe.
+    # An id may occur in several pairs; only disjoint pairs are merged now, the rest at a later keyframe.
     _, first = np.unique(np.concatenate([winners, losers]), return_index=True)
     once = np.zeros(2 * len(a), dtype=bool)
     once[first] = True

@@ -24,12 +24,13 @@ from edgeslam_torch.optim.problem import LmConfig, StopReason, WindowProblem, Wi
 logger = logging.getLogger(__name__)
 
 EFFECTIVE_SAMPLES = 2.4
-"""Errors of neighbours on one edge are correlated: about six count as one (the root of six)."""
+"""Errors of neighbouring pixels on an edge are correlated: about six count as one (the root of six)."""
 ITERATIONS = 30
 COST_TOLERANCE = 1e-5
 MU = 1e-8
-"""Every refinement goes to the end: a drift of the scale, or a turn taken for a shift, is a slow mode, which a solver
-that stops at a percent of the cost, or is damped by the stiff modes, never reaches (docs/decisions/12-solver.md)."""
+"""Initial damping. Every refinement converges fully: scale drift, or rotation explained as translation, is a slow mode,
+which a solver that stops at a percent of the cost, or is damped by the stiff modes, never corrects
+(docs/decisions/12-solver.md)."""
 
 
 def lm_config(config: WindowConfig) -> LmConfig:
@@ -51,10 +52,10 @@ def last_refinement(
 
     Args:
         slam_map: Refined in place.
-        camera: Of its keyframes.
-        edges: Their edges, in place as well.
-        config: Which terms take part.
-        telemetry: Its displacements, heights and gravity take part; None for none.
+        camera: Intrinsics of its keyframes.
+        edges: Their edges, also refined in place.
+        config: Selects the terms.
+        telemetry: Adds displacements, heights and gravity; None for none.
 
     Returns:
         Result of the last solver run; None if there was nothing to refine.

@@ -1,4 +1,4 @@
-"""Rejoining of old anchors: two keyframes that observe the same place but share no anchors because of drift.
+"""Local loop closure: two keyframes observe the same place but share no anchors because of drift.
 
 A search of a few pixels (`mapping/fuse.py`) misses anchors that drift has moved farther. Here an old keyframe's
 anchors are searched in a larger radius and accepted if one camera pose explains them. The poses must already be near
@@ -24,7 +24,7 @@ RADIUS_PX = 30.0
 RATIO = 0.85
 """Maximum ratio of nearest to second nearest descriptor distance."""
 MIN_INLIERS = 15
-"""As many anchors as make two keyframes covisible (`SlamMap.covisible`)."""
+"""Number of shared anchors from which on two keyframes are covisible (`SlamMap.covisible`)."""
 MIN_SHARE = 0.5
 """Minimum share of inliers: the majority of the matches."""
 MAX_TURN_RAD = np.deg2rad(30.0)

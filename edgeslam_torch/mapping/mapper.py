@@ -1,4 +1,4 @@
-"""Stage 3 and 4 for one keyframe: cull, triangulate, fuse, refine, cull keyframes."""
+"""Stages 3 and 4 for one keyframe: cull, triangulate, fuse, refine, cull keyframes."""
 
 from dataclasses import replace
 
@@ -33,10 +33,10 @@ from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.types import FloatArray, IntArray
 
 WIDE = 60
-"""Keyframes of a wide window: some 20 s of flight. Of 25, two fixed poses determine the scale of so
-few that a drifted one swings past the truth."""
+"""Keyframes of a wide window: some 20 s of flight. With 25, the two fixed poses dominate the scale and its correction
+overshoots."""
 WIDE_EVERY = 4
-"""Windows until the next wide one: about a second in flight."""
+"""Period of wide windows, in windows: about a second in flight."""
 WIDE_STEPS = 100
 """Maximum number of solver steps: 15 are typical, the first run after a long drift takes several times that."""
 ENOUGH_ANCHORS = 300
@@ -45,7 +45,7 @@ EMPTY_RADIUS_PX = 25.0
 """Minimum distance of a keypoint in an empty region from the next anchor."""
 
 ONLY_VIEW = 0.5
-"""Share of a keyframe's anchors that would go with it above which it is the only view of its place."""
+"""Share of a keyframe's anchors that culling it would remove, above which it is the only view of its place."""
 
 
 class Mapper:
@@ -53,10 +53,10 @@ class Mapper:
 
     Args:
         slam_map: The map.
-        camera: Of its keyframes.
+        camera: Intrinsics of its keyframes.
         config: All settings.
         lm: Settings of the solver.
-        edges: Measured edges, which may join the refinement; None for none.
+        edges: Measured edges for the refinement; None for none.
     """
 
     def __init__(
@@ -72,13 +72,13 @@ class Mapper:
         flying = config.window.flying
         self._edges = None if edges is None or flying is None else WindowEdges(edges, camera, flying, flying=True)
         self._windows = 0
-        """Since the last wide one."""
+        """Number of windows since the last wide one."""
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
 
     def insert(
         self, keyframe: Keyframe, colour: np.ndarray, telemetry: TelemetryModel | None = None
     ) -> WindowResult | None:
-        """Insert a new keyframe: cull, triangulate, fuse, rejoin, refine.
+        """Insert a new keyframe: cull, triangulate, fuse, close local loops, refine.
 
         Args:
             keyframe: Already in the map; ``keyframe.anchor`` has the matches of tracking.
@@ -115,7 +115,7 @@ class Mapper:
     def _take_back_drift(self, keyframe: Keyframe, telemetry: TelemetryModel) -> None:
         """Refine the recent map with telemetry every few keyframes.
 
-        Fixed keyframes around a window keep its scale, right or drifted, against telemetry.
+        The fixed keyframes of a small window preserve its scale, drifted or not, against telemetry.
         """
         self._windows += 1
         if self._windows < WIDE_EVERY:
@@ -247,7 +247,7 @@ class Mapper:
         return add_on_prior(self.map, self.camera, keyframe, chosen, prior[chosen, 0], prior[chosen], colour[chosen])
 
     def cull_keyframes(self, newest: Keyframe) -> None:
-        """Remove covisible keyframes whose anchors three others see at the same or finer scale; bound the map."""
+        """Remove covisible keyframes whose anchors three others see at the same or finer scale; limit the map size."""
         for other in self.map.covisible(newest, 2 * self.config.window):
             if other.id == 0 or newest.id - other.id < 3:
                 continue
@@ -261,9 +261,9 @@ class Mapper:
             self.map.remove_keyframe(needless)
 
     def _most_needless(self, newest: Keyframe) -> Keyframe | None:
-        """The most redundant keyframe outside the window; ties to the oldest.
+        """The most redundant keyframe outside the window; of equal ones, the oldest.
 
-        None while each is the only view of its place, until there are twice as many as `MappingConfig.max_keyframes`.
+        None if each is the only view of its place and there are fewer than twice `MappingConfig.max_keyframes`.
         """
         others = [k for k in self.map.keyframes.values() if newest.id - k.id >= self.config.window]
         lost = [self._lost_without(k) for k in others]
@@ -273,6 +273,6 @@ class Mapper:
         return others[least]
 
     def _lost_without(self, keyframe: Keyframe) -> float:
-        """Share of a keyframe's anchors that only one other keyframe sees, or none: they would go with it."""
+        """Share of a keyframe's anchors that at most one other keyframe sees; culling it removes them."""
         observed = keyframe.anchor[keyframe.anchor >= 0]
         return float(np.mean(self.map.anchors.observations[observed] <= 2)) if len(observed) else 0.0

@@ -1,4 +1,4 @@
-"""Motion factors of a window from what telemetry says of its keyframes."""
+"""Motion factors of a window from telemetry at its keyframes."""
 
 import math
 from collections.abc import Sequence
@@ -13,22 +13,22 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
 
 EFFECTIVE_SAMPLES = 120.0
-"""Keypoints err together: a window's thousands of reprojections, taken for independent, hold a wrong scale against
-telemetry whose covariance is honest. So many of them count as one in flight, four times as many as for corners
-on whole pixels, since they are aligned to a fifth of one (docs/decisions/15-telemetry-in-windows.md)."""
+"""Number of correlated reprojections that count as one in flight. Keypoint errors are correlated: thousands of
+reprojections treated as independent outweigh telemetry with a realistic covariance. The number is four times that of
+corners at whole pixels, since corners are aligned to a fifth of a pixel (docs/decisions/15-telemetry-in-windows.md)."""
 ATTITUDE = 0.25
-"""Share of that for attitude, if it is more than one: its errors, of leaning and of the mount, do not average."""
+"""Factor on this number for attitude, at least one in total: errors of tilt and camera mount are systematic."""
 ALIKE_AT_THE_END = 1.0
-"""The same in the last refinement: what drifted was taken back in flight, and telemetry's own errors, which have
-a memory of seconds, would bend the map."""
+"""The same in the last refinement: drift was corrected in flight, and telemetry errors, correlated over seconds, would
+deform the map."""
 GUESSED = 3000.0
-"""The same for gravity in a young map while nothing has told metres: what turns and what moves is told apart by guessed
-depths, which err together in all of the picture."""
+"""The same for gravity in a new map without metric scale: predicted depths, whose errors are correlated over the whole
+image, distinguish rotation from translation."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotionFactors:
-    """What telemetry adds to a window."""
+    """Telemetry factors of a window."""
 
     centres: tuple[CentreFactor, ...] = ()
     gravity: tuple[GravityFactor, ...] = ()
@@ -42,20 +42,20 @@ def motion_factors(
     scale_sigma_log: float | None = None,
     effective_samples: float = EFFECTIVE_SAMPLES,
 ) -> MotionFactors:
-    """Factors between keyframes that follow each other in time, piece by piece.
+    """Factors between temporally consecutive keyframes of each submap.
 
     Args:
-        model: Telemetry and what ties it to the map; None where it is silent.
+        model: Telemetry and its relation to the map; None without telemetry.
         keyframes: Of the window, in the order of its poses.
-        piece: Number of each one's piece of map: where one lies relative to another is not known.
-        scale_sigma_log: How far the scale may be off, common to all; the model's own doubt when None.
-        effective_samples: How many keypoints count as one beside it.
+        piece: Submap number of each keyframe; the relative pose of submaps is unknown.
+        scale_sigma_log: Standard deviation of the common log scale; None for the model's own.
+        effective_samples: Number of correlated reprojections that count as one.
     """
     if model is None:
         return MotionFactors()
     centres, gravity, turned = [], [], []
     for number in sorted(set(piece)):
-        # Keyframes of earlier flights have no time on this one's clock.
+        # Stamps of keyframes from a loaded map are not on this run's clock.
         members = [i for i, p in enumerate(piece) if p == number and np.isfinite(keyframes[i].stamp_s)]
         if not members:
             continue

@@ -1,6 +1,6 @@
 """Processing of a new keyframe: image, depth, anchors, refinement, edges.
 
-At once, or on the one thread of an executor while the next frames are tracked.
+Synchronous, or on the single thread of an executor while the next frames are tracked.
 """
 
 from concurrent.futures import Executor, Future
@@ -20,7 +20,7 @@ from edgeslam_torch.types import FloatArray, Frame
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """Keyframes whose mapping is done."""
+    """Result of mapping a batch of keyframes."""
 
     keyframes: list[Keyframe]
     T_tracked: FloatArray
@@ -34,9 +34,9 @@ class MappingPipeline:
     Args:
         mapper: Anchors and refinement.
         edges: Edge map.
-        camera: Of the frames.
-        depth: Depth network, if there is one.
-        executor: With one thread, for real time; None to map at once.
+        camera: Intrinsics of the frames.
+        depth: Depth network; None for none.
+        executor: With one thread, for real time; None for synchronous mapping.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class MappingPipeline:
         self.camera = camera
         self.depth = depth
         self.has_metres = False
-        """Whether the depth network has given metres yet."""
+        """Whether the depth network has provided metric depth yet."""
         self._executor = executor
         self._pending: Future[Mapped] | None = None
 
@@ -62,14 +62,14 @@ class MappingPipeline:
         return self._pending is not None
 
     def submit(self, new: list[tuple[Frame, Keyframe]], telemetry: TelemetryModel | None = None) -> Mapped | None:
-        """Map keyframes that were put into the map; None when that happens while others go on."""
+        """Map keyframes that are already in the map; None if this runs asynchronously."""
         if self._executor is None:
             return self._run(new, telemetry)
         self._pending = self._executor.submit(self._run, new, telemetry)
         return None
 
     def collect(self, wait: bool = False) -> Mapped | None:
-        """Result of the last submission once it is done; None before, or without one."""
+        """Result of the last submission once it is complete; None before, or without one."""
         if self._pending is None or not (wait or self._pending.done()):
             return None
         pending, self._pending = self._pending, None
@@ -81,7 +81,7 @@ class MappingPipeline:
             self._executor.shutdown(wait=True, cancel_futures=True)
 
     def look(self, frame: Frame, keyframe: Keyframe) -> None:
-        """Give a keyframe its undistorted image and depth."""
+        """Set a keyframe's undistorted image and depth."""
         keyframe.image = self.camera.undistort_image(frame.image)
         keyframe.grey = as_grey(keyframe.image)
         keyframe.depth = None if self.depth is None else self.depth(keyframe.image, self.camera)
@@ -90,7 +90,7 @@ class MappingPipeline:
             self.has_metres = True
 
     def _run(self, new: list[tuple[Frame, Keyframe]], telemetry: TelemetryModel | None) -> Mapped:
-        """The only thing that runs on the executor."""
+        """Map a batch; the only function that runs on the executor."""
         stage_ms: dict[str, float] = {}
         T_tracked = new[-1][1].T_c_w
         for frame, keyframe in new:

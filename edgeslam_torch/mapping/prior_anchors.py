@@ -1,7 +1,7 @@
 """Anchors with a depth prior, for cameras with little parallax: rotation, hover, distant scenes.
 
-Such an anchor has a host keyframe, along whose ray the depth network (or its neighbours) expects it at an inverse depth
-with a standard deviation. Refinement takes the expectation as one more measurement, as a stereo camera would give it;
+Such an anchor has a host keyframe and, along its ray, an expected inverse depth with a standard deviation, from the
+depth network or from neighbouring anchors. Refinement treats it as another measurement, like that of a stereo camera;
 once two keyframes see the anchor with enough parallax, the prior is dropped.
 """
 
@@ -69,7 +69,7 @@ def add_on_prior(
     prior: FloatArray,
     colour: np.ndarray,
 ) -> IntArray:
-    """New anchors on keypoints ``(M,)`` of a host keyframe, which observes them.
+    """Add anchors with depth priors on keypoints ``(M,)`` of a host keyframe, which observes them.
 
     Args:
         slam_map: Receives them.
@@ -100,8 +100,8 @@ def depth_priors(slam_map: SlamMap, anchor: IntArray, poses: list[int]) -> tuple
         poses: Keyframe ids of the window's poses, in order.
 
     Returns:
-        The priors, and the ids of hosts outside of the window, whose poses follow in this order; none when no anchor
-        rests on a prior.
+        The priors, and the ids of hosts outside the window, whose poses follow in this order; None and no ids if no
+        anchor has a prior.
     """
     row = np.flatnonzero(slam_map.anchors.from_depth[anchor])
     if len(row) == 0:
@@ -131,10 +131,10 @@ def drop_needless_priors(slam_map: SlamMap, keyframe: Keyframe, min_parallax_rad
 
 
 def depth_slack_px(anchors: Anchors, ids: IntArray, T_c_w: FloatArray, camera: Camera) -> FloatArray | None:
-    """Image uncertainty of anchors whose depths rest on priors, one sigma ``(M, 2)`` [px].
+    """Image uncertainty of anchors with depth priors, one sigma ``(M, 2)`` [px].
 
     Along the epipolar line of the host's ray; proportional to the parallax, hence zero for a rotating camera. None
-    when no depth rests on a prior.
+    if no anchor has a prior.
     """
     unsure = np.flatnonzero(anchors.from_depth[ids])
     if len(unsure) == 0:
@@ -150,7 +150,7 @@ def depth_slack_px(anchors: Anchors, ids: IntArray, T_c_w: FloatArray, camera: C
 
 
 def mostly_on_priors(anchors: Anchors, ids: IntArray) -> bool:
-    """Whether most of the anchors rest on priors: images then hardly distinguish rotation from translation."""
+    """Whether most of the anchors have depth priors: images then hardly distinguish rotation from translation."""
     return int(np.count_nonzero(anchors.from_depth[ids])) > 0.5 * len(ids)
 
 

@@ -28,28 +28,28 @@ from edgeslam_torch.optim.unit import MIN_EXTENT, with_same_depths, with_same_wa
 from edgeslam_torch.types import IntArray
 
 UNKNOWN_SCALE_LOG = 1.0
-"""Standard deviation of the log of the metres per map unit where nothing but the window's own telemetry tells them."""
+"""Standard deviation of the log of the metres per map unit if only the window's own telemetry determines it."""
 
 SPOT = 0.5
-"""Way of a camera, relative to the depth that it sees, up to which it has turned on the spot and been nowhere else."""
+"""Maximum distance of the cameras of a rotation on the spot, relative to the scene depth."""
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Keyframes to refine, keyframes that hold the gauge, and the anchors of the former."""
+    """Keyframes to refine, keyframes that fix the gauge, and the anchors of the former."""
 
     free: list[Keyframe]
     fixed: list[Keyframe]
     anchor: IntArray
     freed: Weight = Weight.NONE
-    """How the bias of depths on priors is undone."""
+    """Correction of the bias by depth priors."""
     young: bool = False
-    """A whole young map: its newest keyframe, the last free one, is as tracking placed it."""
+    """Whether this is a whole new map, whose newest keyframe, the last free one, has the pose of tracking."""
     settled: bool = False
-    """Written back only if the solver has reached a minimum: half-way the newest keyframes, which are being tracked on,
-    can be anywhere."""
+    """Whether only a converged result is written back: intermediate poses of the newest keyframes, against which
+    tracking runs, are arbitrary."""
     effective_samples: float = EFFECTIVE_SAMPLES
-    """How many of its keypoints count as one beside telemetry."""
+    """Number of correlated reprojections that count as one relative to telemetry."""
 
 
 def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) -> Window:
@@ -71,10 +71,10 @@ def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) ->
 
 
 def young_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
-    """The whole piece of map of the newest keyframe, while it has at most ``most`` keyframes.
+    """The whole submap of the newest keyframe while it has at most ``most`` keyframes.
 
-    A map that began with predicted depths of a wrong shape has a turn where there was a shift, and the other way round,
-    which a window with two fixed poses, one of them wrong, cannot undo.
+    A map initialised with wrong predicted depths confuses rotation with translation, which a window with two fixed
+    poses, one of them wrong, cannot correct.
     None for fewer than three keyframes, or a camera that never moved.
     """
     piece = slam_map.piece_of(newest.id)
@@ -86,12 +86,12 @@ def young_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
 
 
 def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
-    """The newest ``most`` keyframes of a piece of map as one window.
+    """The newest ``most`` keyframes of a submap as one window.
 
-    The earlier keyframe that sees most of the same anchors holds it, its own first one if there is none, and its older
-    part holds the unit (`with_same_way`): two poses beside each other would not. None for fewer than three, or a camera
-    that never moved, or one that is back where it was before them: known ground has its unit, and what telemetry says
-    of one visit more would tear its anchors from the keyframes that made it.
+    The earlier keyframe that shares most anchors is fixed, or its own first one without such; the length of its older
+    part fixes the scale (`with_same_way`), for which two neighbouring poses are too close. None for fewer than three
+    keyframes, a camera that never moved, or a revisit of earlier ground: its scale is determined, and the telemetry of
+    one more visit would move its anchors away from the keyframes that created them.
     """
     piece = slam_map.piece_of(newest.id)
     keyframes = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
@@ -116,7 +116,7 @@ def refine_all(
     freed: Weight = Weight.NONE,
     effective_samples: float = EFFECTIVE_SAMPLES,
 ) -> WindowResult | None:
-    """Refine every keyframe of the map at once; None when there is nothing to refine, see `whole_map`."""
+    """Refine every keyframe of the map jointly; None if there is nothing to refine, see `whole_map`."""
     window = whole_map(slam_map, freed, effective_samples)
     return None if window is None else refine(slam_map, window, camera, config, telemetry)
 
@@ -137,9 +137,8 @@ def whole_map(
 def held_extent(window: Window) -> ScalePrior | None:
     """Scale prior if only one pose is fixed: the distance to the farthest other pose. None if no pose is free.
 
-    Two fixed poses fix the scale themselves; coincident poses have none. The newest pose of a young map has not been
-    refined and may be anywhere: another one holds the scale. In the map of an earlier flight it is the
-    farthest pose of that flight: a metre is as long as it was.
+    Two fixed poses fix the scale themselves; coincident poses have none. The newest pose of a new map is excluded, as
+    it is not refined yet. In a loaded map it is the farthest loaded pose, which preserves the map's scale.
     """
     if len(window.fixed) != 1 or not window.free:
         return None
@@ -211,10 +210,10 @@ def window_problem(
     growth = slam_map.scale_factor ** np.arange(slam_map.levels, dtype=np.float64)
     sigma_px = np.where(np.isnan(aligned), growth[octave], aligned)
     unsure = slam_map.anchors.from_depth[window.anchor]
-    # If most depths rest on priors, these fix the scale; the distance between poses of a rotating camera is noise.
+    # If most depths have priors, these fix the scale; the distance between poses of a rotating camera is noise.
     extent = None if unsure.sum() > 0.5 * len(unsure) else held_extent(window)
     priors, hosts = depth_priors(slam_map, window.anchor, [k.id for k in keyframes])
-    # Where the scale is held by one distance alone, that one is arbitrary.
+    # A single distance fixes the gauge and carries no information on the metric scale.
     doubt = UNKNOWN_SCALE_LOG if extent is not None else None
     told = motion_factors(
         telemetry, keyframes, [slam_map.piece_of(k.id) for k in keyframes], doubt, window.effective_samples
@@ -240,11 +239,11 @@ def window_problem(
 
 
 def tracked_motions(slam_map: SlamMap, keyframes: list[Keyframe]) -> tuple[RelativePosePrior, ...]:
-    """How tracking placed those of a window's keyframes that still see mostly anchors on priors.
+    """Relative poses from tracking, as priors for keyframes of a window that see mostly anchors with depth priors.
 
-    Refined together with such depths, a pose that hardly moved runs away: from a shifted camera every depth can follow
-    its pixel's noise, from a turned one none can. Tracking widens the noise by the depths' uncertainty instead and is
-    free of this.
+    Joint refinement with such depths biases the pose of a camera that hardly moved: under translation every depth can
+    fit its pixel's noise, under rotation none can. Tracking inflates the noise by the depths' uncertainty instead and
+    is unbiased.
     """
     pose_of = {k.id: pose for pose, k in enumerate(keyframes)}
     motions = []
@@ -260,10 +259,10 @@ def tracked_motions(slam_map: SlamMap, keyframes: list[Keyframe]) -> tuple[Relat
 def write_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], result: WindowResult) -> None:
     """Write the result of `window_problem` back to the map; outlier observations are removed.
 
-    Not where the solver ran out of steps: half-way, residuals do not tell which observations are wrong, and a keyframe
-    that loses its right ones hangs on nothing.
+    They are kept if the solver ran out of steps: before convergence, residuals do not identify wrong observations, and
+    a keyframe that loses correct ones is no longer constrained.
     """
-    if result.stop is StopReason.NOT_FINITE:  # its residuals say nothing, so no observation disagrees
+    if result.stop is StopReason.NOT_FINITE:  # residuals are meaningless, so no observation is an outlier
         return
     keyframes = [*window.free, *window.fixed]
     with slam_map.lock:

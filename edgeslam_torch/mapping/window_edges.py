@@ -1,4 +1,4 @@
-"""Edges and corners of a window's keyframes as terms of its refinement: while flying and at the end."""
+"""Edge and corner terms of a window's refinement, in flight and at the end."""
 
 from dataclasses import dataclass, replace
 
@@ -22,7 +22,7 @@ from edgeslam_torch.optim.problem import WindowProblem
 from edgeslam_torch.types import FloatArray
 
 FEW_ANCHORS = 100
-"""Anchors of a keyframe below which edges join its window: as many as start a map, and as tracking's threshold."""
+"""Number of anchors of a keyframe below which its window gets edge terms: the minimum to start a map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +39,12 @@ class Placed:
 
 
 class WindowEdges:
-    """Makes the terms of windows; remembers the last window's indexed edges.
+    """Creates the terms of windows; caches the last window's indexed edges.
 
     Args:
         edges: Measured edges by keyframe.
-        camera: Of the keyframes.
-        config: Which terms, and in which form.
+        camera: Intrinsics of the keyframes.
+        config: Terms and their form.
         flying: Keyframes whose edges are not measured yet take part as targets.
     """
 
@@ -55,10 +55,10 @@ class WindowEdges:
         self.flying = flying
         self.terms = term_config(config)
         self._indexed: dict[int, _Indexed] = {}
-        """Of the last window, by keyframe."""
+        """Indexed edges of the last window, by keyframe id."""
 
     def wanted(self, newest: Keyframe) -> bool:
-        """Whether the window of a new keyframe gets terms while flying."""
+        """Whether the window of a new keyframe gets edge terms in flight."""
         if self.config.in_flight == "few":
             return newest.features.faint or int(np.count_nonzero(newest.anchor >= 0)) < FEW_ANCHORS
         return self.config.in_flight == "always"
@@ -88,7 +88,7 @@ class WindowEdges:
             host.p_c[index] = self.camera.back_project(host.uv[index], 1.0 / inverse_depth[mine])
 
     def _structures(self, keyframes: list[Keyframe]) -> list[Structure]:
-        """The keyframes' edges; only their depths are read anew where a keyframe was in the last window too."""
+        """The keyframes' edges; of a keyframe in the last window, only depths are updated."""
         hosts = {h.keyframe_id: h for h in self.edges.hosts}
         self._indexed = {k.id: self._index(k, hosts.get(k.id)) for k in keyframes}
         return [self._indexed[k.id].now(hosts.get(k.id)) for k in keyframes]
@@ -121,7 +121,7 @@ class _Indexed:
     structure: Structure
 
     def now(self, host: EdgePoints | None) -> Structure:
-        """With depths as they are now."""
+        """With current depths."""
         if host is None or len(self.structure.field.edges.uv) != len(host.uv):
             return self.structure
         z = host.p_c[:, 2]

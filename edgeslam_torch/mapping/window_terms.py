@@ -241,7 +241,7 @@ def _junction_depths(structure: Structure, config: TermConfig) -> tuple[FloatArr
     near = np.take_along_axis(away, best, 0)[0] <= 2.0
     depth, sigma = field.inverse_depth[partner].astype(np.float64), structure.sigma[partner].astype(np.float64)
     given = near & (depth > 0)
-    if config.collinearity == "literal":  # metres off the line, all alike: d(1 / z) = dz / z^2
+    if config.collinearity == "literal":  # equal sigma in metres off the line: d(1 / z) = dz / z^2
         sigma = depth * depth
     sigma = np.where(given, sigma, 1.0)
     prior, information = collinearity_prior(np.where(given, fraction, np.nan), depth, sigma)
@@ -311,7 +311,7 @@ def _match(
 def _ordered(
     uv: FloatArray, inverse_depth: FloatArray, arms: FloatArray, T_j_i: FloatArray, K: tuple[float, float, float, float]
 ) -> FloatArray:
-    """Seen arms ``(Q, 2, 2)`` in the order of the host's arms: seen from behind, the order is reversed."""
+    """Observed arms ``(Q, 2, 2)`` in the order of the host's arms, which reverses if seen from behind."""
     projected, _ = _project(T_j_i, uv, inverse_depth, K)
     mine = _unit(projected[:, 1:] - projected[:, :1])
     swap = (mine * arms).sum(2).min(1) < (mine * arms[:, ::-1]).sum(2).min(1)

@@ -1,1 +1,1 @@
-"""Edge points: their depth by epipolar search, those of keyframes, and those of the newest picture."""
+"""Edge points: depth by epipolar search, edges of keyframes, and edges of the newest image."""

@@ -1,4 +1,4 @@
-"""Depth of edge pixels: the prior narrows a search along the epipolar lines of several keyframes.
+"""Depth of edge pixels by a search along the epipolar lines of several keyframes, within a depth prior.
 
 The depth network (or the anchors around a pixel) says roughly how deep an edge is; where exactly is measured, as in
 semi-dense mapping (Engel et al., ICCV 2013; Mur-Artal and Tardos, RSS 2015), by comparing the grey profile across
@@ -67,7 +67,7 @@ class EdgeDepth:
 
 @dataclass(frozen=True, slots=True)
 class _Sampling:
-    """How grey values across an edge are read."""
+    """Sampling of grey values across an edge."""
 
     offsets_px: FloatArray
     """``(P, 1, 1)`` along the edge's normal."""
@@ -80,18 +80,18 @@ _FINE = _Sampling(np.array([-4.0, -2.0, 0.0, 2.0, 4.0], np.float32)[:, None, Non
 
 @dataclass(frozen=True, slots=True)
 class _Lines:
-    """Epipolar lines of the host's edges in a target, which sees inverse depth ``rho`` at ``ray + rho step``."""
+    """Epipolar lines of the host's edges in a target: inverse depth ``rho`` projects to ``ray + rho step``."""
 
     grey: NDArray[np.uint8]
     ray: FloatArray
-    """``(3, E)`` homogeneous pixels of edges infinitely far away."""
+    """``(3, E)`` homogeneous pixels of edges at infinity."""
     step: FloatArray
     """``(3,)``"""
     normal: FloatArray
     """``(2, E)`` unit normals of the edges."""
 
     def of(self, edges: IntArray) -> "_Lines":
-        """The lines of some edges."""
+        """The lines of selected edges."""
         return _Lines(self.grey, self.ray.take(edges, axis=1), self.step, self.normal.take(edges, axis=1))
 
     def pixels(self, rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -130,7 +130,7 @@ def measure_edge_depth(
     pixel, across = uv.T.astype(np.float32), normal.T.astype(np.float32)
     reach = np.exp(2.5 * prior_sigma_log)
     low, high = ((1.0 / (prior_depth * reach)).astype(np.float32), (reach / prior_depth).astype(np.float32))
-    with np.errstate(divide="ignore", invalid="ignore"):  # pixels of edges beside or behind a target; infinite costs
+    with np.errstate(divide="ignore", invalid="ignore"):  # points beside or behind a target get infinite cost
         lines = [_epipolar_lines(host, target, pixel, across, camera) for target in targets]
         edges, rho, step = _coarse_search(_smooth(host.grey), pixel, across, lines, low, high, camera, most)
         for part in _parts(len(edges)):
@@ -172,7 +172,7 @@ def _coarse_search(
     camera: Camera,
     most: int,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Edges ``(N,)`` with a unique minimum, its inverse depth and the search's step."""
+    """Edges ``(N,)`` with a unique minimum, the inverse depth of the minimum and the step of the search."""
     ends = [_measurable(line, low, high, camera) for line in lines]
     share, length = np.stack([s for s, _ in ends]), np.stack([n for _, n in ends])
     searched = np.flatnonzero(share.sum(axis=0) >= MIN_SHARE)
@@ -200,7 +200,7 @@ def _coarse_search(
 def _fine_search(
     profile: NDArray[np.uint8], lines: list[_Lines], rho: FloatArray, step: FloatArray, camera: Camera
 ) -> FloatArray:
-    """Inverse depth ``(E,)`` of the lowest cost around ``rho``, by a parabola; NaN where there is no good one."""
+    """Inverse depth ``(E,)`` of the lowest cost around ``rho``, by a parabola; NaN where no cost is low enough."""
     count = 7
     first = rho - count // 2 * step
     share = np.stack([_measurable(line, first, first + (count - 1) * step, camera)[0] for line in lines])
@@ -240,7 +240,7 @@ def _cost(
 ) -> FloatArray:
     """Mean truncated grey difference ``(D, E)`` from profiles ``(P, E)`` over the targets, weighted by ``share``.
 
-    The ``count`` hypotheses of an edge begin at the inverse depth ``first`` and are ``step`` apart.
+    The ``count`` hypotheses of an edge start at the inverse depth ``first`` with spacing ``step``.
     """
     total = np.zeros((count, len(first)), np.float32)
     hypothesis = np.arange(count, dtype=np.float32)[:, None]
@@ -278,8 +278,8 @@ def _across(
 def _difference(seen: NDArray[np.uint8], expected: NDArray[np.uint8]) -> FloatArray:
     """Mean truncated difference ``(D, E)`` of profiles ``(P, D, E)`` from the host's ``(P, E)``, in grey levels.
 
-    Half of a common brightness change is removed: exposure drifts, but brightness also distinguishes edges. All of it
-    in 16-bit integers, which hold the ``2 P``-th part of a grey level exactly and are four times as fast as floats.
+    Half of a common brightness change is removed: exposure drifts, but brightness also distinguishes edges. 16-bit
+    integers represent the ``2 P``-th part of a grey level exactly and are four times as fast as floats.
     """
     parts = 2 * len(seen)
     difference = seen.astype(np.int16)

@@ -22,11 +22,11 @@ AGREE_DEPTH = 0.04
 RECENT_HOSTS = 40
 """Number of latest keyframes compared with a new one."""
 CHECKED = 100
-"""Edges of a keyframe that are measured again to see whether all must be."""
+"""Edges of a keyframe that are measured again to decide whether all must be."""
 OFF_LOG = 0.05
-"""Median change of their log depth beyond which they must: twice the largest relative sigma of an edge."""
+"""Median change of their log depth above which all are measured again: twice the largest relative sigma of an edge."""
 NEARLY = 0.1
-"""Relative standard deviation of a depth that tells an obstacle: 10 cm at a metre."""
+"""Maximum relative standard deviation of the depth of an obstacle: 10 cm at a metre."""
 PRIOR_CELL_PX = 8
 """Side of the cells whose edges share a depth prior."""
 
@@ -48,8 +48,8 @@ class EdgePoints:
     observations: IntArray
     """``(E,)`` keyframes that measured the same point, this one included."""
     keypoint_z: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """``(N,)`` depths of the keyframe's keypoints when its edges' depths were right, NaN without a triangulated anchor;
-    empty where they are not known."""
+    """``(N,)`` depths of the keyframe's keypoints when its edges were measured, NaN without a triangulated anchor;
+    empty if unknown."""
 
     def grow(self, scale: float) -> None:
         """Multiply all depths."""
@@ -84,7 +84,7 @@ class EdgeMap:
         keep = 0 if everything else self.config.delay_keyframes
         while len(self._waiting) > keep:
             keyframe = self.map.keyframes.get(self._waiting.pop(0))
-            if keyframe is not None:  # it may have been found redundant meanwhile
+            if keyframe is not None:  # it may have been culled meanwhile
                 self._measure(keyframe)
                 # The grey image is kept for other keyframes' edges; the rest (3 MB) is released.
                 keyframe.image = keyframe.depth = None
@@ -100,7 +100,7 @@ class EdgeMap:
     def _measured(
         self, keyframe: Keyframe, uv: FloatArray, normal: FloatArray, colour: NDArray[np.uint8]
     ) -> tuple[EdgePoints | None, IntArray]:
-        """Those of a keyframe's edges whose depth can be told, and which; None without another view of them."""
+        """Edges of a keyframe with measurable depth, and their indices; None without another view of them."""
         targets = self._targets(keyframe)
         if not targets or keyframe.grey is None:
             return None, np.zeros(0, dtype=np.int64)
@@ -142,7 +142,7 @@ class EdgeMap:
         return z
 
     def follow_anchors(self) -> None:
-        """Change the depths of each keyframe's edges as refinement has changed those of its anchors since.
+        """Scale the depths of each keyframe's edges as refinement has scaled the depths of its anchors.
 
         They were measured with the poses of their time. A refinement that changes the scale of a place moves anchors
         and poses, and edges that stay behind pull the poses back in the next one. Where more than
@@ -162,7 +162,7 @@ class EdgeMap:
                 self.hosts[i] = self._measured_again(host, keyframe)
 
     def _measured_again(self, host: EdgePoints, keyframe: Keyframe) -> EdgePoints:
-        """A keyframe's edges with the depths that the poses of now give them."""
+        """A keyframe's edges, measured again with the current poses."""
         again, _ = self._measured(keyframe, host.uv, host.normal, host.colour)
         if again is None:
             return host
@@ -171,7 +171,7 @@ class EdgeMap:
         return again
 
     def _is_off(self, host: EdgePoints, keyframe: Keyframe) -> bool:
-        """Whether some of a keyframe's edges, measured with the poses of now, lie elsewhere."""
+        """Whether a sample of a keyframe's edges, measured with the current poses, has other depths."""
         some = np.arange(0, len(host.uv), max(1, len(host.uv) // CHECKED))
         again, which = self._measured(keyframe, host.uv[some], host.normal[some], host.colour[some])
         if again is None or len(which) < MIN_ANCHORS:
@@ -180,7 +180,7 @@ class EdgeMap:
         return abs(float(np.median(change))) > OFF_LOG
 
     def add(self, points: EdgePoints) -> None:
-        """Add the measured edges of a keyframe, and remove others beyond the limit."""
+        """Add the measured edges of a keyframe; remove others above the limit."""
         with self.map.lock:
             recent = self.hosts[-RECENT_HOSTS:]
             for other in self._overlapping(self.map.keyframes[points.keyframe_id], recent):
@@ -215,7 +215,7 @@ class EdgeMap:
                     return
 
     def _targets(self, keyframe: Keyframe) -> list[Keyframe]:
-        """Covisible keyframes whose baseline is long enough to measure and short enough to look alike."""
+        """Covisible keyframes whose baseline is long enough for parallax and short enough for similar appearance."""
         depth = self.map.median_depth(keyframe) or 1.0
         chosen = []
         for other in self.map.covisible(keyframe, 4 * self.config.targets, min_shared=30):
@@ -229,7 +229,7 @@ class EdgeMap:
         return [h for h in hosts if h.keyframe_id in near][-8:]
 
     def _agreeing(self, points: EdgePoints, other: EdgePoints) -> tuple[IntArray, IntArray]:
-        """Which points of two keyframes they measured alike: the cycle of paper eqs. (17)-(22), as a test."""
+        """Indices of points with consistent depth in both keyframes: the cycle of paper eqs. (17)-(22), as a test."""
         if len(points.uv) == 0:
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
         painted = PaintedEdges.of(points.uv, (self.camera.width, self.camera.height))
@@ -249,7 +249,7 @@ class EdgeMap:
         A consistent snapshot, callable from any thread.
 
         Args:
-            piece: Number of the piece of map whose edges are wanted; None for all.
+            piece: Number of the submap; None for all.
         """
         with self.map.lock:  # the arrays are copies from here on
             hosts = [h for h in self.hosts if piece is None or self.map.piece_of(h.keyframe_id) == piece]
@@ -268,10 +268,10 @@ class EdgeMap:
         return fuse_voxels(p_w[agreed], sigma[agreed], colour[agreed], count[agreed], self.config.voxel * float(depth))
 
     def around(self, keyframe: Keyframe) -> FloatArray:
-        """Edge points ``(E, 3)`` in the map's world that several keyframes agree on, of those that see the same as one.
+        """Edge points ``(E, 3)`` in the map's world that several of a keyframe's covisible keyframes agree on.
 
-        A consistent snapshot, callable from any thread, at a fraction of the cost of all `points`. Their depth is
-        known to `NEARLY`.
+        A consistent snapshot, callable from any thread, at a fraction of the cost of all `points`. The relative
+        standard deviation of their depth is at most `NEARLY`.
         """
         with self.map.lock:
             same = [h for h in self.hosts if h.keyframe_id == keyframe.id]
@@ -290,7 +290,7 @@ class EdgeMap:
 def fuse_voxels(
     p_w: FloatArray, sigma: FloatArray, colour: NDArray[np.uint8], count: IntArray, voxel: float
 ) -> PointCloud:
-    """One point per occupied cell: the inverse-variance mean of what lies in it."""
+    """One point per occupied cell: the inverse-variance mean of its points."""
     if len(p_w) == 0:
         return PointCloud(p_w.astype(np.float32), colour, sigma.astype(np.float32), count.astype(np.int32))
     cell = np.floor(p_w / voxel).astype(np.int64)

@@ -1,1 +1,1 @@
-"""Where up is in a map, by straight edges and by an accelerometer."""
+"""The vertical of a map, from straight edges and from an accelerometer."""

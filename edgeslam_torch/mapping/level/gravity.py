@@ -1,4 +1,4 @@
-"""Where up is by an accelerometer: its mean force, turned into the map by the visual poses; and with edges."""
+"""The vertical from an accelerometer: its mean specific force in map coordinates; fusion with that from edges."""
 
 import math
 
@@ -9,27 +9,27 @@ from edgeslam_torch.types import FloatArray
 
 _G_M_S2 = 9.81
 _OFF = 0.15
-"""Relative deviation of a mean force from gravity beyond which it is none: another unit, or a fall."""
+"""Maximum relative deviation of a mean force from gravity; beyond, the unit is wrong or the camera falls."""
 _MIN_S = 0.5
-"""Time that a mean needs."""
+"""Minimum duration of a mean."""
 _MAX_GAP_S = 0.2
-"""Pose further from a reading than this does not turn it."""
+"""Maximum time between a reading and the pose that rotates it into the map."""
 _MAX_SIGMA = math.radians(8.0)
-"""Less sure than this tells nothing."""
+"""Maximum standard deviation of a usable result."""
 _CONTRADICTION = 3.0
-"""Sigmas between gravity and edges beyond which one of them is wrong."""
+"""Number of sigmas between gravity and edges above which they contradict each other."""
 
 
 def up_by_gravity(force: SpecificForce, stamps_s: FloatArray, T_w_c: FloatArray) -> Up | None:
-    """Where up is in a map; None where the readings do not tell.
+    """Vertical of a map from accelerometer readings; None if they do not determine it.
 
-    The mean force is gravity's reaction and the mean acceleration, which is the change of velocity over the time. That
-    one is unknown without metres; how much the halves of the time disagree stands for it.
+    The mean force is the reaction to gravity plus the mean acceleration, the change of velocity over the duration. This
+    is unknown without a metric scale; the difference between the two halves serves as its uncertainty.
 
     Args:
         force: Readings.
         stamps_s: ``(F,)`` stamps of the poses.
-        T_w_c: ``(F, 4, 4)``.
+        T_w_c: ``(F, 4, 4)`` poses.
     """
     if len(stamps_s) < 2:
         return None
@@ -51,13 +51,13 @@ def up_by_gravity(force: SpecificForce, stamps_s: FloatArray, T_w_c: FloatArray)
 
 
 def best_known(by_gravity: Up | None, by_edges: Up | None) -> Up | None:
-    """Where up is by both; by the surer one, if that is an accelerometer and they contradict each other."""
+    """Fuse both verticals; gravity alone if it is more certain and they contradict each other."""
     if by_gravity is None or by_edges is None:
         return by_gravity or by_edges
     sigma = math.hypot(by_gravity.sigma_rad, by_edges.sigma_rad)
     apart = math.acos(float(np.clip(by_gravity.direction @ by_edges.direction, -1.0, 1.0)))
     if apart > _CONTRADICTION * sigma:
-        return by_gravity  # edges take one axis of a room for another; gravity does not
+        return by_gravity  # edges may confuse the axes of a room, gravity cannot
     weights = np.array([by_gravity.sigma_rad, by_edges.sigma_rad]) ** -2.0
     both = weights[0] * by_gravity.direction + weights[1] * by_edges.direction
     return Up(both / np.linalg.norm(both), float(weights.sum()) ** -0.5, "accelerometer+edges")

@@ -1,10 +1,10 @@
-r"""Where up is by straight edges: verticals meet in one direction, and horizontals of all directions lie across it.
+r"""The vertical from straight edges: vertical edges are parallel to it, horizontal ones perpendicular.
 
-Each straight segment of a keyframe has a great circle on which its direction lies, known to a fraction of a degree, and
-by its edges' depths a place on it, known to some degrees. All keyframes vote in the map's world. What most segments lie
-along or across is up to the three axes of a room; which of them is up is decided by how people and drones hold and turn
-cameras (about the vertical), and by how much is horizontal: floors, desks and what lies on them. If those do not agree,
-up is not known.
+The direction of a straight segment lies on a great circle known to a fraction of a degree; the depths of its edges give
+its position on the circle to some degrees. All keyframes vote in the map's world. The direction that most segments are
+parallel or perpendicular to is one of the three axes of a room; which of them is vertical follows from how people and
+drones hold and rotate cameras (about the vertical), and from the share of horizontal segments: floors, desks and
+objects on them. If these disagree, the vertical is unknown.
 """
 
 import math
@@ -21,48 +21,48 @@ from edgeslam_torch.mapping.edges.edge_map import NEARLY, EdgePoints
 from edgeslam_torch.types import FloatArray, IntArray
 
 _MOST_KEYFRAMES, _MOST_SEGMENTS = 40, 800
-"""That vote, spread evenly over the run, the longest: bounds the time to half a second."""
+"""Maximum number of keyframes, spread evenly over the run, and of segments, the longest: half a second."""
 _LEAST_KEYFRAMES, _LEAST_SEGMENTS = 10, 40
 _MIN_LENGTH = 0.05
-"""Shortest segment, share of the picture's width."""
+"""Minimum length of a segment relative to the image width."""
 _MIN_POINTS = 6
-"""Edges with depth that tell a segment's direction in space."""
+"""Minimum number of edges with depth for a segment's direction in space."""
 
 _CIRCLE_RAD = math.radians(1.0)
-"""Standard deviation of a segment's great circle, and of how parallel things are built."""
+"""Standard deviation of a segment's great circle, including how parallel buildings are."""
 _ALONG_RAD = math.radians(4.0)
-"""The same along the great circle, at best."""
+"""Minimum standard deviation along the great circle."""
 _ACROSS_RAD = math.radians(1.5)
 """Standard deviation of a horizontal segment's inclination."""
 _BLURS = (4.0, 3.0, 2.0, 1.5, *[1.0] * 8)
-"""Factors on these in the steps of a refinement, which begins far from the maximum."""
+"""Factors on these sigmas in the steps of a refinement, coarse to fine for a wide basin of convergence."""
 _CANDIDATES = 1500
 _APART = math.cos(math.radians(12.0))
-"""Candidates nearer to one another are one."""
+"""Candidates at smaller angles are merged."""
 _ELSEWHERE = math.cos(math.radians(30.0))
-"""And further apart, different axes."""
+"""Candidates at larger angles are different axes."""
 
 _ROLL_RAD, _PITCH_RAD, _USUAL_PITCH_RAD = math.radians(15.0), math.radians(30.0), math.radians(-10.0)
-"""How cameras are held: level to the sides, looking down rather than up."""
+"""Prior of a camera's attitude: standard deviations of roll and pitch, and mean pitch (cameras look slightly down)."""
 _ANY_WAY = 0.1
-"""Share of cameras that are held in any other way, such as turned phones."""
+"""Share of cameras in any other attitude, such as rotated phones."""
 _ODDS = 6.0
-"""By which the best candidate must be more likely than every other."""
+"""Minimum likelihood ratio of the best candidate to every other."""
 _LEAST = 0.025
-"""Share of the segments' length that must tell it."""
+"""Minimum share of the segments' length that supports it."""
 _FAR_FROM_UP = math.cos(math.radians(65.0))
-"""Larger angles of the images' mean up are not believed: a turned camera, which edges alone do not tell from a tilt."""
+"""Maximum angle from the images' mean up axis; edges alone cannot distinguish a rotated camera from a tilted one."""
 
 _BUILT_RAD = math.radians(1.5)
-"""What is built and put up is level to this, and maps are true to it."""
+"""Deviation of buildings from level, and accuracy of map directions."""
 _DEPTH_RAD = math.radians(2.0)
-"""Common error of directions that rest on depths."""
+"""Common error of directions derived from depths."""
 _CIRCLES_TELL = 5.0
-"""Great circles along the vertical tell so much more of it than directions across it."""
+"""Weight of segments along the vertical relative to those across it."""
 _BLOCKS = 4
-"""Parts of the run that are left out in turn."""
+"""Number of parts of the run for the jackknife."""
 _MAX_SIGMA = math.radians(4.0)
-"""Less sure than this is not known."""
+"""Maximum standard deviation of a usable result."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,30 +70,30 @@ class Segments:
     """Straight segments in the map's world."""
 
     normal: FloatArray
-    """``(S, 3)`` of their great circles."""
+    """``(S, 3)`` normals of their great circles."""
     direction: FloatArray
-    """``(S, 3)`` unit."""
+    """``(S, 3)`` unit directions."""
     sigma_rad: FloatArray
-    """``(S,)`` of the direction along the great circle."""
+    """``(S,)`` standard deviation of the direction along the great circle."""
     length: FloatArray
-    """``(S,)`` in the picture, in focal lengths."""
+    """``(S,)`` length in the image [focal lengths]."""
     keyframe: IntArray
     """``(S,)`` number of the keyframe."""
 
     def take(self, which: IntArray) -> "Segments":
-        """Some of them."""
+        """Selected segments."""
         return Segments(
             self.normal[which], self.direction[which], self.sigma_rad[which], self.length[which], self.keyframe[which]
         )
 
 
 def up_by_edges(keyframes: Sequence[Keyframe], hosts: Sequence[EdgePoints], camera: Camera) -> Up | None:
-    """Where up is in the map; None where edges do not tell.
+    """Vertical of the map; None if edges do not determine it.
 
     Args:
-        keyframes: Of one piece of map, oldest first.
+        keyframes: Of one submap, oldest first.
         hosts: Measured edges.
-        camera: That took them; what its focal length may be off goes into sigma.
+        camera: Intrinsics; the uncertainty of the focal length contributes to sigma.
     """
     points = {host.keyframe_id: host for host in hosts}
     voting = [k for k in keyframes if k.id in points and k.grey is not None]
@@ -106,12 +106,12 @@ def up_by_edges(keyframes: Sequence[Keyframe], hosts: Sequence[EdgePoints], came
 
 
 def vertical(segments: Segments, R_w_c: FloatArray, focal_sigma: float = 0.0) -> Up | None:
-    """Where up is by segments; None where they do not tell.
+    """Vertical from segments; None if they do not determine it.
 
     Args:
         segments: Of all keyframes.
-        R_w_c: ``(K, 3, 3)`` the keyframes' rotations, in the order of time.
-        focal_sigma: Relative, of the camera.
+        R_w_c: ``(K, 3, 3)`` the keyframes' rotations, in temporal order.
+        focal_sigma: Relative standard deviation of the focal length.
     """
     longest = np.sort(np.argsort(-segments.length, kind="stable")[:_MOST_SEGMENTS])
     segments = segments.take(longest)
@@ -141,7 +141,7 @@ def vertical(segments: Segments, R_w_c: FloatArray, focal_sigma: float = 0.0) ->
 def segments_of(
     keyframe: Keyframe, points: EdgePoints, camera: Camera, detector: cv2.LineSegmentDetector, number: int
 ) -> Segments:
-    """Segments of one keyframe whose depth its edges tell; a line's inverse depth is affine along its picture."""
+    """Segments of one keyframe with depth from its edges; a line's inverse depth is affine along its image."""
     assert keyframe.grey is not None
     half = cv2.resize(keyframe.grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     found = detector.detect(half)[0]
@@ -199,7 +199,7 @@ def _joined(parts: Sequence[Segments]) -> Segments:
 
 
 def _directions(segments: Segments) -> FloatArray:
-    """Directions ``(D, 3)`` of segments, and those that lie across two of them."""
+    """Candidate directions ``(D, 3)``: those of segments, and cross products of pairs."""
     rng = np.random.default_rng(0)
     i, j = rng.integers(len(segments.length), size=(2, _CANDIDATES))
     d = segments.direction
@@ -208,7 +208,7 @@ def _directions(segments: Segments) -> FloatArray:
 
 
 def _weights(v: FloatArray, segments: Segments, blur: float = 1.0) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """How well segments lie along and across directions ``(D, 3)``, ``(D, S)`` each, and sigma of the latter [rad]."""
+    """Weights ``(D, S)`` of segments along and across directions ``(D, 3)``, and sigma of the latter [rad]."""
     sigma = np.hypot(np.minimum(segments.sigma_rad, 1.0), _ALONG_RAD)
     beside = v @ np.cross(segments.normal, segments.direction).T
     along = np.exp(-0.5 * ((v @ segments.normal.T / (blur * _CIRCLE_RAD)) ** 2 + (beside / sigma) ** 2))
@@ -223,11 +223,11 @@ class _Support:
     along: FloatArray
     across: FloatArray
     square: FloatArray
-    """Of those across, the part that lies across the rest of them: one direction alone has a whole circle across it."""
+    """Of those across, the part with perpendicular partners: one direction alone has a whole circle across it."""
 
 
 def _support(v: FloatArray, segments: Segments) -> _Support:
-    """What lies along and across directions ``(D, 3)``."""
+    """Support for directions ``(D, 3)`` by segments along and across them."""
     weight, d, shares = segments.length / segments.length.sum(), segments.direction, []
     outer = (d[:, :, None] * d[:, None, :]).reshape(-1, 9)
     for part in np.array_split(v, max(1, len(v) // 256)):
@@ -248,7 +248,7 @@ def _peaks(v: FloatArray, support: FloatArray, most: int = 8) -> list[FloatArray
 
 
 def _refined(v: FloatArray, segments: Segments) -> FloatArray:
-    """The direction near another that segments along and across it agree on."""
+    """Refine a direction by the segments along and across it."""
     for blur in _BLURS:
         along, across, level = (x[0] for x in _weights(v[None], segments, blur))
         n, d = segments.normal, segments.direction
@@ -260,9 +260,9 @@ def _refined(v: FloatArray, segments: Segments) -> FloatArray:
 
 
 def _likelihood(v: FloatArray, segments: Segments, R_w_c: FloatArray) -> float:
-    """How likely a direction is up, up to a factor."""
+    """Unnormalised likelihood that a direction is the vertical."""
     turns = np.cross(R_w_c[:-1, :, 2], R_w_c[1:, :, 2]) + np.cross(R_w_c[:-1, :, 0], R_w_c[1:, :, 0])
-    turns = turns + np.cross(R_w_c[:-1, :, 1], R_w_c[1:, :, 1])  # twice the rotation vectors, nearly
+    turns = turns + np.cross(R_w_c[:-1, :, 1], R_w_c[1:, :, 1])  # approximately twice the rotation vectors
     about = float(np.mean((turns @ v) ** 2) / max(float(np.mean(turns**2)), 1e-12))
     roll = np.arcsin(np.clip(R_w_c[:, :, 0] @ v, -1.0, 1.0))
     pitch = np.arcsin(np.clip(R_w_c[:, :, 2] @ v, -1.0, 1.0))
@@ -271,7 +271,7 @@ def _likelihood(v: FloatArray, segments: Segments, R_w_c: FloatArray) -> float:
 
 
 def _jackknife(best: FloatArray, segments: Segments) -> float:
-    """Standard deviation [rad] of a direction by leaving out parts of the run in turn."""
+    """Standard deviation [rad] of a direction by the jackknife over parts of the run."""
     count = float(segments.keyframe.max()) + 1.0
     block = np.minimum(segments.keyframe * _BLOCKS // count, _BLOCKS - 1)
     without = np.stack([_refined(best, segments.take(np.flatnonzero(block != b))) for b in range(_BLOCKS)])
