@@ -1,6 +1,6 @@
 """Rigid motions as ``(4, 4)`` matrices in numpy float64; tangents ``xi = (rho, phi)``, applied on the left.
 
-Same order as the torch solver and kornia. These functions serve the per-frame path, where a numpy call costs a tenth
+Same order as kornia. These functions serve the per-frame path, where a numpy call costs a tenth
 of a torch call and ten operations on Python floats cost one numpy call.
 """
 
@@ -18,10 +18,13 @@ def hat(phi: FloatArray) -> FloatArray:
         >>> hat(np.array([1.0, 2.0, 3.0])) @ np.array([0.0, 0.0, 1.0])
         array([ 2., -1.,  0.])
     """
-    x, y, z = np.moveaxis(np.asarray(phi, dtype=np.float64), -1, 0)
-    zero = np.zeros_like(x)
-    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
-    return np.stack(rows, axis=-1).reshape(*np.shape(x), 3, 3)
+    phi = np.asarray(phi, dtype=np.float64)
+    x, y, z = phi[..., 0], phi[..., 1], phi[..., 2]
+    out = np.zeros((*phi.shape, 3))
+    out[..., 0, 1], out[..., 0, 2] = -z, y
+    out[..., 1, 0], out[..., 1, 2] = z, -x
+    out[..., 2, 0], out[..., 2, 1] = -y, x
+    return out
 
 
 def exp(xi: FloatArray) -> FloatArray:
