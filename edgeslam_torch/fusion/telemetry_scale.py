@@ -1,4 +1,4 @@
-"""Metric scale from the drone's velocities and heights: what they say of the map, alone and together."""
+"""Metric scale from the drone's velocities and heights, each alone and combined."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -42,40 +42,40 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 _MOST_ROUNDS = 5
 _SETTLED = 0.003
-"""Relative change of the scale below which remainders need not be computed again: a third of `systematic_log`."""
+"""Relative change of the scale below which the remainders are not recomputed: a third of `systematic_log`."""
 _MOST_CHANGE = 0.5
 _UNDITHERED = 0.05
-"""Error of all remainders together, in steps: with 0.2 to 0.3 steps of noise before the rounding a reading is off by
-0.15 to 0.05 steps in the mean, up or down with the speed, and the speeds of a flight average two thirds of it."""
+"""Residual error of the remainders [steps]. With 0.2 to 0.3 steps of noise before rounding, the mean reading is off by
+0.15 to 0.05 steps with a sign that varies with speed; averaging over speeds leaves about two thirds."""
 _MOST_SIGMA = 0.5
-"""Relative sigma beyond which a source on its own says nothing."""
+"""Relative sigma above which a single source is discarded."""
 _GOOD_HEIGHT = 0.2
-"""Relative sigma with which a height source is good enough; the next one would say the same less well."""
+"""Relative sigma at which the search stops: the remaining height sources observe the same motion less accurately."""
 _HEIGHT_BIN_S = 0.5
 _HEIGHT_SOURCES = {"tof": "sigma_tof_m", "h": "sigma_h_m", "baro": "sigma_baro_m"}
 _HEIGHT_STEP_M = {"tof": 0.01, "h": 0.1, "baro": 0.01}
-"""Steps in which the SDK tells them."""
+"""Quantisation steps of the SDK's heights."""
 _OF_A_VIEW = 0.15
-"""By how much the network's metres usually differ between two views that share nothing. So do the units of the parts of
-a map whose drone only turns: no parallax holds them together."""
+"""Typical change of the depth network's log scale between two views without overlap. The scales of submaps connected by
+pure rotation differ by as much: no parallax constrains them."""
 _LEAST_CLIMB_M = 0.05
 _LEAST_CLIMB_SIGMAS = 2.0
 _LEAST_CHANGES = 2
-"""Changes of height beyond that within a second from which on heights alone tell metres: without any, their slope is
-that of what drifts, the sensor or the map."""
+"""Minimum number of such height changes within a second for a scale from heights alone; with fewer, drift of the sensor
+or of the map dominates the slope."""
 _LEAST_MOVING, _LEAST_SHARE, _ROUGH_LOG = 4, 0.25, 0.2
-"""Moving intervals, and share of the motion that velocities must explain, for a ratio of lengths to mean anything, and
-that ratio's error."""
+"""Minimum number of moving intervals and minimum share of explained motion for a ratio of path lengths, and the error
+of that ratio."""
 _EXPLAINED = 0.98
-"""Correlation of velocities and images, their means left in, below which a fifth of the way (root mean square) is
-unexplained: whole steps of 0.1 m/s leave less, and so does a delay that is 0.25 s off."""
+"""Correlation of velocities and images, means included, below which the unexplained motion exceeds 20 % RMS: more than
+quantisation to 0.1 m/s or a delay error of 0.25 s leaves."""
 _MOST_STEPS = 0.3
-"""Share of height readings that may step: more is not furniture passing below."""
+"""Maximum share of height readings classified as floor steps; furniture causes fewer."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceScale:
-    """Scale by one source on its own."""
+    """Scale from one source alone."""
 
     value: float
     """Metres per map unit."""
@@ -83,38 +83,38 @@ class SourceScale:
 
 
 _FADING = 0.1
-"""What a map that has changed its scale may change it further until the next fit, seconds later."""
+"""Log scale uncertainty that is added to a changed map's scale until the next fit, seconds later."""
 
 
 @dataclass(frozen=True, slots=True)
 class TelemetryFit:
-    """What the newest fit found, for prediction and for the report."""
+    """Result of the newest fit, for prediction and for the report."""
 
     moved: Evidence | None = None
     """From displacements."""
     sources: dict[str, SourceScale] = field(default_factory=dict)
-    """Velocities (``telemetry``) and ``height`` on their own."""
+    """Velocities (``telemetry``) and ``height``, each alone."""
     shortfall_m_s: float = 0.0
-    """How much every velocity that is not zero reads low, as likely as not."""
+    """Expected truncation loss of every non-zero velocity reading."""
     truncates: float = 0.5
     """Probability that velocities are truncated, not rounded."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Hypothesis:
-    """Scale under one reading of the velocities: rounded to the nearest step, or truncated."""
+    """Scale under one rounding mode of the velocities."""
 
     log_scale: float
     sigma: float
     log_odds: float
-    """How well it explains the displacements, up to a constant, less what puts velocity and height apart."""
+    """Log-likelihood of the displacements up to a constant, with a penalty on the gap between velocity and height."""
     fit: TelemetryFit
     at_odds: AtOdds | None
 
 
 @dataclass(frozen=True, slots=True)
 class _Given:
-    """One kind of evidence with what it says alone."""
+    """One kind of evidence with the scale that it gives alone."""
 
     name: str
     evidence: Evidence
@@ -124,37 +124,37 @@ class _Given:
 
     @property
     def opinion(self) -> LogScale:
-        """In logarithms."""
+        """The estimate in the log domain."""
         return LogScale(math.log(self.scale), self.sigma, self.name)
 
 
 @dataclass(frozen=True, slots=True)
 class _Shown:
-    """What velocities are compared with."""
+    """Inputs of the displacement fit."""
 
     intervals: Displacements
     """On telemetry's clock."""
     told: FloatArray
-    """``(N, 3)`` their displacements by the readings as they are [m]."""
+    """``(N, 3)`` displacements by the raw readings [m]."""
     velocity: SeenVelocity
     start: float
-    """Scale to begin with, from the lengths of both."""
+    """Initial scale: the ratio of path lengths."""
 
     @property
     def speed(self) -> float:
-        """Root mean square [map units/s]."""
+        """RMS speed [map units/s]."""
         return math.sqrt(
             float(np.mean(np.sum((self.intervals.moved / self.intervals.duration_s[:, None]) ** 2, axis=1)))
         )
 
     @property
     def ends_s(self) -> FloatArray:
-        """Starts and ends ``(2 N,)``."""
+        """Starts and ends ``(2 N,)`` of the intervals."""
         return np.concatenate([self.intervals.from_s, self.intervals.to_s])
 
 
 def _shared_drift(given: list[_Given]) -> float:
-    """Error of a mean of velocities and heights that its sigma lacks: the drift of the map is the same for both."""
+    """Correlated error of velocities and heights in their mean: both inherit the drift of the map."""
     if len(given) < 2:
         return 0.0
     weight = np.array([g.sigma for g in given]) ** -2.0
@@ -163,26 +163,26 @@ def _shared_drift(given: list[_Given]) -> float:
 
 
 def _by_steps(z_m: FloatArray, step_m: float) -> float:
-    """Relative error of a scale by heights ``(N,)`` in steps of ``step_m``, which no repetition removes.
+    """Relative scale error due to heights ``(N,)`` quantised to ``step_m``; repetition does not reduce it.
 
-    A height errs by the same whenever the drone passes it again. The slope of the rounded height over an even motion
-    through ``m`` steps is wrong by ``-1 / m**2`` (from edge to edge) to ``+1 / (2 m**2)`` (from middle to middle).
+    The same height always has the same quantisation error. Over a uniform climb through ``m`` steps the slope is off by
+    ``-1 / m**2`` (from edge to edge) to ``+1 / (2 m**2)`` (from middle to middle).
     """
     return min(1.0, (step_m / max(float(np.ptp(z_m)), 1e-6)) ** 2)
 
 
 class TelemetryScale:
-    """Scale from displacements and height at one moment; `SensorGate` learns what the heights are worth.
+    """Scale from displacements and heights at one moment; updates the height verdicts of `SensorGate`.
 
     Args:
         config: Settings.
         T_b_c: Camera in the body ``(4, 4)`` [m].
-        present: What is remembered.
-        trust: Which readings may be used.
+        present: Visual poses and telemetry so far.
+        trust: Which readings are usable.
         delay_s: Video delay behind telemetry.
-        turned: How the map is turned against the power-on world.
-        held: Scale that was believed before [metres per map unit].
-        flying: Whether the present scale is asked for, of a map that drifts; in the end one scale holds for all of it.
+        turned: Rotation of the map relative to the power-on world.
+        held: Previous scale [metres per map unit].
+        flying: Estimate the present scale of a drifting map; otherwise one scale for the whole map.
     """
 
     def __init__(
@@ -204,11 +204,10 @@ class TelemetryScale:
         self._shown = self._compared() if trust.velocity else None
 
     def opinion(self) -> tuple[LogScale, TelemetryFit] | None:
-        """Scale for readings rounded to the nearest step or truncated; ``None`` where nothing tells.
+        """Scale averaged over both rounding modes; ``None`` without a usable source.
 
-        The mean of both, weighted by how probable each is; its sigma spans them while that is open. The better one of
-        them explains the sweeps through zero and the displacements that the images show, and the less it puts velocity
-        and height at odds, the more probable it is.
+        Modes are weighted by their posterior probability: sweeps through zero, likelihood of the displacements, and
+        consistency of velocity and height. The sigma covers both modes.
         """
         config = self._config
         fixed = {"nearest": Rounding.NEAREST, "truncate": Rounding.TRUNCATE}.get(config.velocity_rounding)
@@ -220,7 +219,7 @@ class TelemetryScale:
         tried = (Rounding.NEAREST, Rounding.TRUNCATE) if fixed is None else (fixed,)
         moved = {r: self._by_displacements(r) for r in tried}
         compared = all(evidence is not None for evidence in moved.values())
-        if not compared:  # what cannot be compared is not chosen from
+        if not compared:  # the rounding modes compare only if both have displacements
             moved = dict.fromkeys(tried)
         few = self._shown is None or len(self._shown.intervals) < MIN_DISPLACEMENTS
         torn = all(evidence is not None and evidence.torn for evidence in moved.values())
@@ -243,7 +242,7 @@ class TelemetryScale:
         return self._unless_parted(LogScale(mean, math.sqrt(variance), "+".join(fit.sources)), fit)
 
     def _unless_parted(self, before: LogScale, fit: TelemetryFit) -> tuple[LogScale, TelemetryFit]:
-        """What the flight says, or the last seconds where these leave no room for it."""
+        """The scale of the whole flight, or that of the last seconds if both contradict each other."""
         now = (self._at_present() or self._lately()) if self._flying else None
         if now is None or not at_odds(now, before):
             self._trust.parted = None
@@ -253,12 +252,12 @@ class TelemetryScale:
         return now, replace(fit, moved=None, sources={"telemetry": SourceScale(scale, scale * now.sigma)})
 
     def _lately(self) -> LogScale | None:
-        """A present scale found before, less sure of itself each time that nothing new tells one."""
+        """The previous present scale, with a sigma that grows until new motion is measured."""
         last = self._trust.parted
         return None if last is None else replace(last.now, sigma=math.hypot(last.now.sigma, _FADING))
 
     def _at_present(self) -> LogScale | None:
-        """By the displacements of the last seconds, if telemetry is of this flight."""
+        """Scale from the displacements of the last seconds, if telemetry is validated."""
         last = self._present.memory.last
         shown = self._compared(by_told=True) if self._trust.proven and last is not None else None
         if shown is None or last is None:
@@ -275,13 +274,13 @@ class TelemetryScale:
         if rough is None:
             return None
         velocity = self._alone("telemetry", moved, systematic, rough)
-        # What velocities do not know as well as the units of views differ by, they do not rule out.
+        # Velocities less accurate than the scale difference between views cannot rule it out.
         vouching = moved if velocity is not None and velocity.sigma < _OF_A_VIEW else None
         given = [g for g in (velocity, self._height_alone(rough, vouching)) if g is not None]
         odds = self._at_odds(*given) if len(given) == 2 else None
         if odds is not None and odds.kept is not None:
             given = [g for g in given if g.name == odds.kept]
-            if odds.kept == "height":  # no surer than without the velocities that were wrong
+            if odds.kept == "height":  # recompute without the drift model of the rejected velocities
                 given = [g for g in (self._height_alone(rough, None),) if g is not None]
         elif [g.name for g in given] == ["height"] and self._nonsense(given[0]):
             given = []
@@ -292,10 +291,10 @@ class TelemetryScale:
         if len(given) == 2:
             one, other = (g.opinion for g in given)
             gap = abs(one.log_scale - other.log_scale) / math.hypot(one.sigma, other.sigma)
-            if contradict(one, other):  # one of them is wrong: the sigma covers both
+            if contradict(one, other):  # one of the two is wrong: the sigma covers both
                 parted_log = abs(one.log_scale - other.log_scale)
         sources = {g.name: SourceScale(g.scale, g.scale * g.sigma) for g in given}
-        # Birge ratio: sources that disagree beyond their sigmas widen the result.
+        # Birge ratio: disagreement beyond the sigmas widens the result.
         sigma = max(parted_log, max(1.0, gap) * math.hypot(together[1], _shared_drift(given)))
         log_odds = (0.0 if moved is None else moved.log_likelihood) - 0.5 * min(gap, CONTRADICTION) ** 2
         moved = moved if "telemetry" in sources else None
@@ -304,7 +303,7 @@ class TelemetryScale:
         return _Hypothesis(math.log(together[0]), sigma, log_odds, fit, odds)
 
     def _alone(self, name: str, evidence: Evidence | None, systematic: float, rough: float) -> _Given | None:
-        """What one kind of evidence says, with the error that no averaging removes."""
+        """Scale from one kind of evidence, with its systematic error."""
         if evidence is None:
             return None
         evidence = evidence.softened(systematic * rough)
@@ -315,7 +314,7 @@ class TelemetryScale:
         return self._alone("height", self._by_height(rough, moved), self._config.height_systematic_log, rough)
 
     def _at_odds(self, velocity: _Given, height: _Given) -> AtOdds | None:
-        """Velocities and heights that cannot both be right, and which one the depth network confirms, if it does."""
+        """Contradictory scales from velocities and heights, and which of them the depth network supports."""
         one, other = velocity.opinion, height.opinion
         if not at_odds(one, other):
             return None
@@ -323,10 +322,10 @@ class TelemetryScale:
         return AtOdds(velocity.scale, height.scale, None if kept is None else kept.source)
 
     def _nonsense(self, height: _Given) -> bool:
-        """Whether velocities that cannot tell the scale themselves still leave no room for that of heights alone.
+        """Whether a scale from heights alone contradicts the ratio of path lengths.
 
-        Where the map's first second is wrong, a climb of decimetres in it is, too, and nothing else asks. Velocities
-        that go with the images to a quarter tell a scale to some tenths by the length of the way.
+        A distorted first second of the map also distorts a climb of decimetres in it. Velocities that explain a quarter
+        of the visual motion determine the scale to some tenths.
         """
         told = self._trust.latest.get(Reading.VELOCITY)
         if told is None or told.count < _LEAST_MOVING or told.share < _LEAST_SHARE:
@@ -338,7 +337,7 @@ class TelemetryScale:
         return True
 
     def _rough(self, moved: Evidence | None) -> float | None:
-        """Metres per map unit to look for floor steps with: by velocities, unless the network contradicts them."""
+        """Rough scale for detecting floor steps: from velocities, unless the network contradicts them."""
         network = self._present.network
         alone = None if moved is None else solved([moved], self._tilt_rad)
         if alone is None:
@@ -348,7 +347,8 @@ class TelemetryScale:
         return self._present.rough_scale if wrong else alone[0]
 
     def _by_displacements(self, rounding: Rounding) -> Evidence | None:
-        """Velocities against displacements: the scale at which their remainders are what the images make expect."""
+        """Fit velocities to displacements; the quantisation remainders depend on the scale, so iterate to a fixed
+        point."""
         shown = self._shown
         if shown is None:
             return None
@@ -370,14 +370,14 @@ class TelemetryScale:
             if abs(change) < _SETTLED:
                 break
             scale *= 1.0 + float(np.clip(change, -_MOST_CHANGE, _MOST_CHANGE))
-        # A scale that may wander explains what truncation leaves out as well: the roundings compare without that.
+        # A wandering scale absorbs truncation errors too, so rounding modes are compared with a constant scale.
         rigid = self._evidence(intervals, whole, None) if self._flying else evidence
         if rigid is None:
             return None
         return replace(self._with_drift(softened, rigid), log_likelihood=rigid.log_likelihood)
 
     def _with_drift(self, evidence: Evidence, rigid: Evidence) -> Evidence:
-        """Evidence of the present scale, and how much less sure it is than that of a scale which never changes."""
+        """Evidence of the present scale, with the uncertainty that drift adds to a constant scale."""
         pair = [solved([e], self._tilt_rad) for e in (evidence, rigid)]
         if pair[0] is None or pair[1] is None:
             return evidence
@@ -397,14 +397,15 @@ class TelemetryScale:
         )
 
     def _aged(self, stamps_s: FloatArray) -> FloatArray | None:
-        """How much the map has aged since each time ``(N,)`` of telemetry's clock; None where that is of no matter."""
+        """Log age of the map since each time ``(N,)`` of telemetry's clock, see `aged_since`; None if drift is not
+        modelled."""
         memory = self._present.memory
         if not self._flying or memory.last is None:
             return None
         return aged_since(stamps_s + self._delay_s, memory.began_s, memory.last.stamp_s)
 
     def _compared(self, by_told: bool = False) -> _Shown | None:
-        """Intervals in which the drone moves, as images and readings have them; ``by_told`` asks the readings which."""
+        """Intervals in which the drone moves; ``by_told`` selects them by telemetry instead of vision."""
         track, config, memory = self._present.track, self._config, self._present.memory
         moved = memory.displacements()
         if len(moved) == 0:
@@ -428,7 +429,7 @@ class TelemetryScale:
         return _Shown(moved, moved_m, velocity, math.sqrt(ways[0] / ways[1]))
 
     def _moving(self, moved: Displacements, moved_m: FloatArray, by_told: bool) -> np.ndarray:
-        """Intervals fast enough to speak of scale, judged by vision once the scale is roughly known."""
+        """Mask of intervals above the minimum speed, measured by vision once the scale is roughly known."""
         if self._held is not None and not by_told:
             speed = np.linalg.norm(moved.moved, axis=1) * self._held / moved.duration_s
         else:
@@ -436,7 +437,7 @@ class TelemetryScale:
         return speed > self._config.min_speed_m_s
 
     def _by_height(self, scale: float, moved: Evidence | None) -> Evidence | None:
-        """The best of range, SDK height and barometer: they watch the same motion."""
+        """Evidence from the most accurate of range sensor, SDK height and barometer: they observe the same motion."""
         config = self._config
         seen = self._present.memory.sightings()
         stamps_s = seen.stamps_s - self._delay_s
@@ -447,7 +448,7 @@ class TelemetryScale:
         for name, (times, z) in self._present.track.heights().items():
             if len(times) < 2:
                 continue
-            # A reading between two sightings, not the other way round: each counts once.
+            # Interpolate poses at readings, not readings at poses: each reading counts once.
             here = (times >= stamps_s[0]) & (times <= stamps_s[-1])
             near = np.clip(np.searchsorted(stamps_s, times), 1, len(stamps_s) - 1)
             here &= stamps_s[near] - stamps_s[near - 1] < config.max_gap_s
@@ -480,20 +481,21 @@ class TelemetryScale:
         return best
 
     def _of_other_views(self, T: FloatArray, wander: float) -> FloatArray:
-        """How much more a map has aged ``(N,)`` that wanders so, as it turned away from what it showed at ``T``."""
+        """Equivalent log age ``(N,)`` for the loss of overlap since the views at ``T``, given the map's scale
+        wander."""
         by_view = max(_OF_A_VIEW, self._present.network_wander_log)
         return turned_since(T) * (by_view / wander) ** 2
 
     def _wander(self, moved: Evidence | None) -> float:
-        """How much the map's scale changes as it ages: by the displacements, if they tell.
+        """Scale wander of the map: from the displacements, or the maximum if velocities leave much unexplained.
 
-        Velocities that had motion enough to prove themselves, have not, and leave a fifth of the way unexplained: a map
-        that changes its scale on the way is what parts them from the images.
+        Velocities with enough motion for validation that leave a fifth of the path unexplained indicate a map whose
+        scale changes along the way.
         """
         if moved is not None:
             return moved.wander
         tried = self._trust.latest.get(Reading.VELOCITY)
-        if tried is None or self._trust.verdict(Reading.VELOCITY) is Verdict.CONTRADICTS:  # of no such flight
+        if tried is None or self._trust.verdict(Reading.VELOCITY) is Verdict.CONTRADICTS:  # telemetry of another flight
             return USUAL_WANDER
         parted = tried.count >= LEAST_COUNT and tried.steady < _EXPLAINED
         return MOST_WANDER if parted else USUAL_WANDER
@@ -507,7 +509,7 @@ class TelemetryScale:
         segment: IntArray,
         scale: float,
     ) -> None:
-        """Compare changes of one height over a second with the images'; a height that only jumps has no excuse."""
+        """Validate one height by its changes over a second; if most changes are steps, they are compared as well."""
         if segment[-1] > _MOST_STEPS * len(segment):
             segment = np.zeros_like(segment)
         least = max(_LEAST_CLIMB_M, _LEAST_CLIMB_SIGMAS * getattr(self._config, _HEIGHT_SOURCES[reading]))
