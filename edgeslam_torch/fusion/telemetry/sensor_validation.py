@@ -1,9 +1,9 @@
-"""Whether telemetry and images show the same motion; telemetry that disagrees is no evidence for the scale.
+"""Validation of telemetry against the images; telemetry that shows another motion is no evidence for the scale.
 
-The test is the correlation of what both say of the same half seconds: displacements, turns, changes of height. It needs
-no scale. How much is needed was measured: displacements of six recordings and two real flights against those of another
-one, or of another time, each at the best of fifteen delays, reach the limit of `Agreement.needed` in 1 % of the cases;
-right telemetry, rounded or truncated like a Tello's, stays below in 1 % with 12 intervals, never with 24.
+The test statistic is the correlation of both over the same half seconds: displacements, rotations, height changes. It
+is independent of the scale. `Agreement.needed` has a false acceptance rate of 1 % on unrelated displacements (the best
+of fifteen delays); matching telemetry, rounded or truncated like a Tello's, fails it in 1 % of the cases with 12
+intervals and never with 24.
 """
 
 import math
@@ -20,30 +20,30 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 LEAST_COUNT = 6
 _EARLY_COUNT, _EARLY = 4, 0.95
-"""Velocities may agree with fewer intervals: before the delay is searched there is one delay to be lucky with. Of 1764
-pairs of unrelated displacements (five recordings, twelve simulated and two real flights) 0.2 % reach this with four
-intervals and 0.1 % with five; right ones, of any four intervals, in 38 %, in a take-off nearly always."""
+"""Velocities may be accepted with fewer intervals, because before the delay search only one delay is tested. The false
+acceptance rate is 0.2 % with four intervals and 0.1 % with five; matching velocities pass with any four intervals in 38
+% of the cases, during take-off nearly always."""
 _TO_CONTRADICT = 12
-"""Moving intervals below which a low correlation may be chance."""
+"""Number of moving intervals below which a low correlation may be chance."""
 _DOUBTFUL = {1: 0.3, 3: 0.5}
-"""Correlation below which series of one and of three dimensions contradict each other. Right ones have 0.74 (velocities
-truncated) and 0.42 (barometer) in the worst 1 %."""
+"""Correlation below which series of one and of three dimensions contradict each other. Matching series have 0.42
+(barometer) and 0.74 (truncated velocities) in the worst 1 %."""
 _EVEN = 0.8
-"""Correlation with the means left in, from which on an even motion explains a low correlation without them."""
+"""Uncentred correlation from which on uniform motion explains a low centred one."""
 _WINSOR = 3.0
-"""Times the median at which lengths are cut off."""
+"""Winsorisation limit, in medians of the length."""
 _SMALL_SHARE = 0.3
 _KEPT = 0.9
-"""Share of the intervals that must fit."""
+"""Share of the intervals used; the worst are dropped as outliers."""
 _LEFT_OVER, _LEFT_OVER_M_S = 0.5, 0.06
-"""What may be left over of one velocity (root mean square): a share of the speed along its axis, and what truncation to
-steps of 0.1 m/s leaves [m/s]. Right ones of eight recordings stay below both."""
+"""Maximum RMS residual of one velocity column: a share of the speed along its axis, and the truncation error of steps
+of 0.1 m/s [m/s]."""
 _LARGE_QUANTILE = 0.9
-"""Intervals shorter than this share of the long ones (the length at this quantile) count as standing still."""
+"""Intervals shorter than this share of the length at this quantile count as hover."""
 
 
 class Reading(StrEnum):
-    """What telemetry tells that the images can be asked about."""
+    """Telemetry readings that are validated by the images."""
 
     VELOCITY = "velocities"
     ATTITUDE = "attitude"
@@ -55,14 +55,14 @@ class Reading(StrEnum):
 HEIGHTS = (Reading.TOF, Reading.H, Reading.BARO)
 ATTITUDE = ("roll", "pitch", "yaw")
 VELOCITY = ("velocity x", "velocity y", "velocity z")
-"""Names of the columns."""
+"""Column names."""
 
 
 class Verdict(StrEnum):
-    """What a comparison says."""
+    """Result of a comparison."""
 
     OPEN = "open"
-    """Too little motion, or undecided."""
+    """Too little motion, or inconclusive."""
     AGREES = "agrees"
     CONTRADICTS = "contradicts"
 
@@ -72,32 +72,32 @@ class Agreement:
     """Agreement of two series of the same motion."""
 
     correlation: float = 0.0
-    """0 when one of them does not move."""
+    """0 when one of them has no motion."""
     count: int = 0
     """Moving intervals compared."""
     dimensions: int = 3
     steady: float = 0.0
-    """The same with the means left in: near 1 for an even motion, which proves nothing and contradicts nothing."""
+    """Uncentred correlation: near 1 for uniform motion, which is inconclusive."""
     early: bool = False
-    """Whether few intervals may prove it."""
+    """Whether few intervals may validate it."""
     broken: tuple[str, ...] = ()
-    """Columns that on their own contradict the images: missing motion, frozen, jumping or of the wrong sign."""
+    """Columns that contradict the images individually: missing motion, frozen, jumping or of the wrong sign."""
 
     @property
     def share(self) -> float:
-        """Share of the one's variance that the other explains."""
+        """Explained share of the variance."""
         return max(self.correlation, 0.0) ** 2
 
     @property
     def needed(self) -> float:
-        """Correlation that unrelated motions hardly reach."""
+        """Correlation that unrelated motions rarely reach."""
         if self.early and self.count < LEAST_COUNT:
             return _EARLY
         return 0.6 + 5.4 / (self.dimensions * max(self.count, 1))
 
     @property
     def verdict(self) -> Verdict:
-        """Agreement has to be proven, and so has contradiction; one broken column spoils the whole."""
+        """Verdict; both acceptance and rejection need evidence, and one broken column rejects the whole reading."""
         if self.broken:
             return Verdict.CONTRADICTS
         least = _EARLY_COUNT if self.early else LEAST_COUNT
@@ -112,18 +112,18 @@ class Agreement:
 def agreement(
     seen: FloatArray, told: FloatArray, least_seen: float, least_told: float, early: bool = False
 ) -> Agreement:
-    """Compare what the images say with what telemetry says, interval by interval.
+    """Correlate visual and telemetry motion interval by interval.
 
     Args:
         seen: ``(N, 1)`` or ``(N, 3)``, in any unit.
         told: The same shape, in any unit.
         least_seen: Length below which ``seen`` is noise; infinite if unknown.
         least_told: The same of ``told``.
-        early: Whether few intervals may prove an agreement.
+        early: Whether few intervals may validate an agreement.
 
     Returns:
-        The correlation about the mean (a bias or an even flight proves nothing) over the intervals in which one of them
-        moves; lone wild readings do not count in full.
+        The winsorised correlation about the mean over the intervals in which either moves. A common bias or uniform
+        motion does not contribute.
     """
     moving = _moving(seen, least_seen) | (np.linalg.norm(told, axis=1) > least_told)
     count, dimensions = int(moving.sum()), seen.shape[1]
@@ -135,15 +135,15 @@ def agreement(
 
 
 def broken_columns(seen: FloatArray, told: FloatArray) -> tuple[str, ...]:
-    """Velocities that contradict the images each on its own.
+    """Velocity columns that contradict the images individually.
 
     Args:
         seen: By the images ``(N, 3)`` [map units/s], axes of the columns.
         told: By telemetry ``(N, 3)`` [m/s].
 
     Returns:
-        Names of those that leave over more than right ones do, whatever a map unit is; the worst intervals are left
-        out. A mean counts: a velocity that froze differs from the images by it.
+        Names of the columns whose residual exceeds the limit at the best scale, without the worst intervals. The mean
+        is included: a frozen velocity differs from the images by it.
     """
     if len(seen) < _TO_CONTRADICT:
         return ()
@@ -156,14 +156,14 @@ def broken_columns(seen: FloatArray, told: FloatArray) -> tuple[str, ...]:
 
 
 def _moving(x: FloatArray, least: float) -> NDArray[np.bool_]:
-    """Intervals longer than noise, and not small beside the long ones: in those even a right map is mostly noise."""
+    """Intervals above the noise and not short compared with the long ones, where map errors dominate."""
     length = np.linalg.norm(x, axis=1)
     large = float(np.quantile(length, _LARGE_QUANTILE)) if len(length) else 0.0
     return np.asarray(length > max(least, _SMALL_SHARE * large))
 
 
 def _tamed(x: FloatArray) -> FloatArray:
-    """Winsorised at three times the median, against outliers."""
+    """Lengths winsorised at three times the median."""
     length = np.linalg.norm(x, axis=1)
     moved = length[length > 0]
     if len(moved) == 0:
@@ -172,22 +172,22 @@ def _tamed(x: FloatArray) -> FloatArray:
 
 
 def _correlation(x: FloatArray, y: FloatArray) -> float:
-    """All axes as one series; 0 when one of them is nothing."""
+    """Correlation of all axes as one series; 0 when either is zero."""
     power = float(np.sum(x**2)) * float(np.sum(y**2))
     return float(np.sum(x * y)) / math.sqrt(power) if power > 1e-24 else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class AtOdds:
-    """Scales [metres per map unit] that cannot both be right."""
+    """Contradictory scales [metres per map unit]."""
 
     by_velocity: float
     by_height: float
     kept: str | None
-    """``telemetry`` (velocities) or ``height``, whichever the depth network confirms; None when it confirms neither."""
+    """``telemetry`` (velocities) or ``height``, whichever the depth network supports; None if it supports neither."""
 
     def warning(self) -> str:
-        """Warning about what is not used."""
+        """Which sources are rejected."""
         said = (
             f"telemetry's velocities and heights contradict each other, {self.by_velocity:.3g} and "
             f"{self.by_height:.3g} m per map unit"
@@ -201,14 +201,14 @@ class AtOdds:
 
 @dataclass(frozen=True, slots=True)
 class Reread:
-    """Velocities are read in another frame than the settings and the reader of the log say."""
+    """Velocities are interpreted in another frame than configured."""
 
     turn: Turn
     before: Agreement
-    """How they went with the images as they had been read."""
+    """Agreement in the configured frame."""
 
     def warning(self, now: Agreement | None) -> str:
-        """What is done, and why."""
+        """The reinterpretation and its reason."""
         frame = {
             Turn.AS_READ: "as they were given",
             Turn.FROM_BODY: "in body axes",
@@ -226,37 +226,37 @@ class SensorGate:
     def __init__(self) -> None:
         self.latest: dict[Reading, Agreement] = {}
         self.elsewhere_s: float | None = None
-        """Video delay at which telemetry fits the images, when that is none of the delays allowed."""
+        """Best-fitting video delay if it is outside the allowed range."""
         self.at_odds: AtOdds | None = None
-        """Scales by velocities and by height where these cannot both be right."""
+        """Contradictory scales of velocities and height, if any."""
         self.parted: Parted | None = None
-        """Set while the last seconds leave no room for the scale of the flight before."""
+        """Set while the scale of the last seconds contradicts that of the flight before."""
         self.tells_scale = True
-        """Whether velocities that may tell the scale could be fitted to the images."""
+        """Whether velocities could be fitted to the displacements."""
         self.reread: Reread | None = None
-        """Set when velocities are read in another frame than they were given in."""
+        """Set when velocities are interpreted in another frame than configured."""
         self._verdicts: dict[Reading, Verdict] = {}
 
     def judge(self, reading: Reading, found: Agreement) -> None:
-        """Take in the newest comparison of one reading."""
+        """Update with the newest comparison of one reading."""
         self.latest[reading] = found
         if found.verdict is not Verdict.OPEN:
             self._verdicts[reading] = found.verdict
 
     def forget(self, reading: Reading) -> None:
-        """Begin anew with a reading that is read in another way."""
+        """Reset the verdict on a reading whose interpretation has changed."""
         self._verdicts.pop(reading, None)
 
     def verdict(self, reading: Reading) -> Verdict:
-        """What is known of a reading."""
+        """Current verdict on a reading."""
         return self._verdicts.get(reading, Verdict.OPEN)
 
     @property
     def velocity(self) -> bool:
-        """Whether velocities may tell the scale: only once they have proven to be of this flight.
+        """Whether velocities may determine the scale: only after validation.
 
-        They come in one message with the attitude, which also turns the map towards them: where that contradicts the
-        images their agreement is chance.
+        They share a message with the attitude, which also rotates the map into their frame: if that contradicts the
+        images, an agreement of velocities is chance.
         """
         if self.elsewhere_s is not None or self.verdict(Reading.ATTITUDE) is Verdict.CONTRADICTS:
             return False
@@ -264,29 +264,30 @@ class SensorGate:
 
     @property
     def attitude(self) -> bool:
-        """Whether attitude may keep the map level: from the first frame on, until the images contradict it."""
+        """Whether attitude may level the map: from the first frame on, until the images contradict it."""
         return self.elsewhere_s is None and self.verdict(Reading.ATTITUDE) is not Verdict.CONTRADICTS
 
     @property
     def turns(self) -> bool:
-        """Whether attitude may say that the camera has not turned: it has turned with the images before."""
+        """Whether attitude may constrain rotations: only after validation."""
         return self.elsewhere_s is None and self.verdict(Reading.ATTITUDE) is Verdict.AGREES
 
     @property
     def proven(self) -> bool:
-        """Whether anything has proven that telemetry is of this flight, and nothing that it is not."""
+        """Whether a reading is validated and none contradicted."""
         readings = (Reading.VELOCITY, Reading.ATTITUDE, *HEIGHTS)
         return self.motion and any(self.verdict(r) is Verdict.AGREES for r in readings)
 
     def height(self, reading: Reading) -> bool:
-        """Whether a height may: it needs the vertical, and its own evidence if nothing else confirms the flight."""
+        """Whether a height is usable: it needs the vertical, and its own validation if no other reading is
+        validated."""
         attitude, own = self.verdict(Reading.ATTITUDE), self.verdict(reading)
         if self.elsewhere_s is not None or attitude is Verdict.CONTRADICTS:
             return False
         return own is Verdict.AGREES or (own is Verdict.OPEN and (self.velocity or attitude is Verdict.AGREES))
 
     def supposing_heights(self) -> "SensorGate":
-        """The same with heights taken for this flight's while nothing speaks for or against them."""
+        """A copy that provisionally accepts undecided heights."""
         supposed = SensorGate()
         supposed.latest, supposed.elsewhere_s = dict(self.latest), self.elsewhere_s
         supposed._verdicts = dict(self._verdicts)
@@ -301,7 +302,7 @@ class SensorGate:
         return self.elsewhere_s is None and not any(self.verdict(r) is Verdict.CONTRADICTS for r in moved)
 
     def warnings(self) -> list[str]:
-        """What is not used, and why, in sentences."""
+        """Rejected readings with reasons."""
         if self.elsewhere_s is not None:
             late = "late" if self.elsewhere_s < 0 else "early"
             return [
@@ -332,7 +333,7 @@ class SensorGate:
 
 
 def _apart(found: Agreement) -> str:
-    """How far from the images attitude is."""
+    """Size of the deviation between attitude and images."""
     if not found.broken:
         return f"roll, pitch and yaw explain {100 * found.share:.0f} % of the turns in the images"
     return f"{', '.join(found.broken)}: other turns than in the images (frozen, jumping, of the wrong sign?)"
@@ -350,16 +351,16 @@ def _why(found: Agreement, motion: str) -> str:
 
 
 def changes(x: FloatArray, stamps_s: FloatArray, segment: IntArray, over_s: float) -> FloatArray:
-    """Changes of means over ``over_s``, from one bin to the next but one, within a segment.
+    """Changes of bin means over ``over_s``, between every second bin, within a segment.
 
     Args:
         x: ``(N, K)``.
         stamps_s: ``(N,)`` increasing.
-        segment: Number of the stretch, from `floor_segments`, ``(N,)``.
+        segment: Segment number from `floor_segments`, ``(N,)``.
         over_s: Length of a bin.
 
     Returns:
-        ``(M, K)``; the rows do not depend on ``x``, so that two calls give partners.
+        ``(M, K)``; the rows depend on stamps and segments only, so that the rows of two calls correspond.
     """
     slot = ((stamps_s - stamps_s[0]) // over_s).astype(np.int64) if len(stamps_s) else np.zeros(0, np.int64)
     key, group = np.unique(np.stack([segment, slot]), axis=1, return_inverse=True)
