@@ -12,12 +12,12 @@ from edgeslam_torch.geometry.rotations import mean_rotation
 from edgeslam_torch.types import FloatArray
 
 LATELY = 5
-"""Pictures that a fault is noticed in at once: half a second."""
+"""Number of recent frames for detecting a sudden fault: half a second."""
 
 
 @dataclass(frozen=True, slots=True)
 class Attitudes:
-    """Cameras in the map beside the drone's attitude."""
+    """Camera rotations in the map, and the drone's attitude."""
 
     stamp_s: FloatArray
     """``(N,)`` on telemetry's clock."""
@@ -43,12 +43,12 @@ class Turns:
 
 @dataclass(frozen=True, slots=True)
 class Apart:
-    """How far attitude and images are apart, beside how the images say that the body turned; about body axes [rad]."""
+    """RMS deviation between attitude and images, and the visual rotation; per body axis [rad]."""
 
     apart: FloatArray
-    """``(3,)`` root mean square of the rotation between both."""
+    """``(3,)`` RMS of the rotation between both."""
     lately: FloatArray
-    """``(3,)`` the same over the newest `LATELY` pictures: a fault that has just begun."""
+    """``(3,)`` the same over the newest `LATELY` frames: a sudden fault."""
     seen: FloatArray
     """``(3,)`` standard deviation of roll, pitch and yaw by the images."""
     rate: FloatArray
@@ -56,15 +56,15 @@ class Apart:
 
 
 def apart(told: Attitudes, R_b_c: FloatArray, sigma_rad: float) -> Apart:
-    """Attitude against the images over the whole flight, the mount and the turn of the map being those that fit best.
+    """Deviation between attitude and images over the whole flight, with mount and map rotation fitted.
 
-    Unlike increments, sums of them show a jump, a reading that froze and a wrong sign alike: the rotation from the map
-    to the power-on world is one and the same in all pictures, or the attitude is not that of this camera.
+    Attitudes, unlike their increments, reveal a jump, a frozen reading and a wrong sign: the rotation from the map to
+    the power-on world must be the same in all frames.
 
     Args:
         told: Both.
-        R_b_c: Camera in the body as it was given ``(3, 3)``.
-        sigma_rad: How far off that may be.
+        R_b_c: Configured camera in the body ``(3, 3)``.
+        sigma_rad: Its standard deviation.
     """
     turned = mount_by_turns(told.R_m_c, told.R_w_b, told.stamp_s, R_b_c, sigma_rad)
     seen = turned.R_w_m @ told.R_m_c @ turned.R_b_c.T
@@ -76,7 +76,7 @@ def apart(told: Attitudes, R_b_c: FloatArray, sigma_rad: float) -> Apart:
 
 
 def attitudes(sightings: Sightings, track: TelemetryTrack, delay_s: float) -> Attitudes | None:
-    """The drone's attitude at each pose in the map that telemetry covers; None where it covers none."""
+    """The drone's attitude at each pose that telemetry covers; None without any."""
     stamps_s = sightings.stamps_s - delay_s
     inside = track.covered(stamps_s, stamps_s)
     if not inside.any():
@@ -85,7 +85,7 @@ def attitudes(sightings: Sightings, track: TelemetryTrack, delay_s: float) -> At
 
 
 def map_to_world(sightings: Sightings, track: TelemetryTrack, delay_s: float, R_b_c: FloatArray) -> FloatArray | None:
-    """Mean of ``R_w_b(telemetry) R_b_c R_m_c^T`` over the remembered poses.
+    """Mean of ``R_w_b(telemetry) R_b_c R_m_c^T`` over the stored poses.
 
     Args:
         sightings: Poses in the map.

@@ -26,22 +26,22 @@ from edgeslam_torch.types import FloatArray
 
 _WIDE_DELAYS_S = (-3.0, 3.0)
 _WIDE_STEP_S = 0.1
-"""Delays beyond the allowed ones are tested if telemetry fits badly: a wrong clock is reported, not used."""
+"""Delays beyond the allowed range are tested if telemetry fits badly: a wrong clock is reported, not used."""
 _FIXED_REACH_S = 0.15
 """Tolerance of a configured delay."""
 _FITS_WELL = 0.9
 _TO_LOOK_ELSEWHERE = 12
-"""Moving intervals before other frames and delays are tried."""
+"""Minimum number of moving intervals before other frames and delays are tested."""
 _MUCH_LIKELIER = 6.0
-"""Log likelihood ratio; half the intervals count as independent."""
+"""Minimum log-likelihood ratio; half the intervals count as independent."""
 _LEAST_TURN_RAD_S = math.radians(2.0)
-"""Whole degrees twice a second are noise below."""
+"""Minimum rotation rate: whole degrees twice a second are noise below."""
 _FEW_ATTITUDES = 15
-"""Pictures that are compared with attitude at least: a second and a half."""
+"""Minimum number of frames for validating attitude: a second and a half."""
 _APART_SHARE, _APART_RAD, MOST_APART_RAD = 0.5, math.radians(2.0), math.radians(6.0)
-"""Root mean square by which attitude and images may be apart about an axis: this share of how the body turned about it,
-within bounds. Right attitude (whole degrees, mount 7 degrees off) is 0.3 to 1 degree apart on six recordings; a frozen
-column is apart by the whole turn, a mirrored one by twice that, one that jumps by a share of the jump."""
+"""Maximum RMS deviation between attitude and images about an axis: a share of the rotation about it, within bounds.
+Correct attitude (whole degrees, mount off by 7 degrees) deviates by 0.3 to 1 degree; a frozen column by the whole
+rotation, a sign error by twice that."""
 _DELAY_STEP_S = 0.1
 
 
@@ -56,13 +56,13 @@ class FlightSoFar:
     rough_scale: float | None
     """Metres per map unit, for what counts as motion."""
     network: LogScale | None = None
-    """Scale by the depth network, a witness where velocities and heights contradict each other."""
+    """Scale by the depth network, which decides between contradictory velocities and heights."""
     network_wander_log: float = 0.0
-    """By how much the network's ratio to the map changes from keyframe to keyframe."""
+    """Variation of the network's log scale between keyframes."""
 
 
 class Comparison:
-    """Updates `SensorGate` with verdicts on velocities and attitude; stores when other delays were last tested."""
+    """Updates `SensorGate` with verdicts on velocities and attitude; records when other delays were last tested."""
 
     def __init__(self, config: FusionConfig) -> None:
         self._config = config
@@ -71,12 +71,11 @@ class Comparison:
     def judge(
         self, trust: SensorGate, present: FlightSoFar, delay: Delay, R_w_m: FloatArray, flying: bool = False
     ) -> None:
-        """Compare at the delay in use, in other frames and, if that fits badly, at other delays.
+        """Compare at the current delay, in other frames and, if the fit is poor, at other delays.
 
-        Velocities that fit significantly better in another frame are read in that frame from now on, overriding
-        settings and reader. A camera that hardly turns, but leans, goes with velocities in body axes to 80 or 90 % as
-        well: a good fit is no proof of the frame. While ``flying`` this is asked as the flight grows, in the end in
-        any case.
+        Velocities that fit significantly better in another frame are interpreted in that frame from now on, overriding
+        settings and reader. A good fit does not prove the frame: a camera that leans without turning correlates by 80
+        to 90 % with velocities in body axes. While ``flying`` the tests are repeated only as data grow.
         """
         attitude = self._attitude(present, delay)
         if attitude is not None:
@@ -92,7 +91,7 @@ class Comparison:
                 present.track.read_as(turn)
                 now = self._velocity(present, delay.value_s, R_w_m)
                 trust.forget(Reading.VELOCITY)
-        if not math.isfinite(delay.sigma_s):  # at another moment every column has another motion
+        if not math.isfinite(delay.sigma_s):  # at a wrong delay every column shows another motion
             now = replace(now, broken=())
         if now.correlation >= _FITS_WELL:
             trust.elsewhere_s = None
@@ -101,7 +100,7 @@ class Comparison:
         trust.judge(Reading.VELOCITY, now)
 
     def _fits_turned(self, present: FlightSoFar, now: Agreement, delay_s: float, R_w_m: FloatArray) -> Turn | None:
-        """The frame in which the velocities surely fit better than in the one they are read in."""
+        """The velocity frame that fits significantly better than the current one, if any."""
         best, best_turn = now, None
         for turn in present.track.other_turns:
             other = replace(present, track=present.track.as_if(turn))
@@ -111,7 +110,7 @@ class Comparison:
         return best_turn if _surely_better(best, now) else None
 
     def _fits_elsewhere(self, present: FlightSoFar, now: Agreement, used_s: float) -> float | None:
-        """The delay at which telemetry surely fits better than now, if that is one which is not allowed."""
+        """The best-fitting delay, if it is significantly better than the current one and not allowed."""
         fixed = self._config.delay_s
         low, high = self._config.delay_range_s if fixed is None else (fixed - _FIXED_REACH_S, fixed + _FIXED_REACH_S)
         best, best_s = now, used_s
@@ -123,9 +122,9 @@ class Comparison:
         return best_s if _surely_better(best, now) and not low <= best_s <= high else None
 
     def _velocity(self, present: FlightSoFar, delay_s: float, R_w_m: FloatArray) -> Agreement:
-        """How velocities go with the images under one delay.
+        """Agreement of velocities with the images at one delay.
 
-        Without the camera's lever arm: rotations must not count as evidence for velocities.
+        The camera's lever arm is left out: rotations must not count as evidence for velocities.
         """
         track, moved = present.track, _in_common(present, delay_s)
         if len(moved) == 0:
@@ -141,7 +140,7 @@ class Comparison:
         return replace(found, broken=broken_columns(seen, told))
 
     def _attitude(self, present: FlightSoFar, delay: Delay) -> Agreement | None:
-        """How attitude goes with them; None where there is none."""
+        """Agreement of attitude with the images; None without common intervals."""
         moved = _in_common(present, delay.value_s)
         if len(moved) == 0:
             return None
@@ -151,7 +150,7 @@ class Comparison:
         return replace(found, broken=self._broken_attitude(present, delay))
 
     def _broken_attitude(self, present: FlightSoFar, delay: Delay) -> tuple[str, ...]:
-        """Columns of attitude that part from the images, at the delay known or at any that may be."""
+        """Attitude columns that contradict the images at the known delay, or at all possible ones."""
         known, sightings = math.isfinite(delay.sigma_s), present.memory.sightings()
         low, high = self._config.delay_range_s
         delays_s = [delay.value_s] if known else np.arange(low, high + 1e-9, _DELAY_STEP_S).tolist()
@@ -166,7 +165,7 @@ class Comparison:
         return tuple(name for name, ratio in zip(ATTITUDE, best.tolist(), strict=True) if ratio > 1.0)
 
     def _parted(self, told: Attitudes, R_b_c: FloatArray, delay_sigma_s: float) -> FloatArray:
-        """How far they are apart about each axis, in what is allowed ``(3,)``."""
+        """Deviation about each axis relative to the allowed one ``(3,)``."""
         found = apart(told, R_b_c, self._config.alignment_sigma_rad)
         share = np.clip(_APART_SHARE * found.seen, _APART_RAD, MOST_APART_RAD)
         late = delay_sigma_s * found.rate
@@ -174,12 +173,12 @@ class Comparison:
 
 
 def _in_common(present: FlightSoFar, delay_s: float) -> Displacements:
-    """Displacements over which there is telemetry; on the video's clock."""
+    """Displacements that telemetry covers, on the video's clock."""
     moved = present.memory.displacements()
     return moved.only(present.track.covered(moved.from_s - delay_s, moved.to_s - delay_s))
 
 
 def _surely_better(best: Agreement, now: Agreement) -> bool:
-    """Whether one reading of the same telemetry is proven, and much likelier than another."""
+    """Whether one interpretation of the same telemetry is validated and significantly more likely."""
     left, left_now = (1.0 - max(a.correlation, 0.0) ** 2 for a in (best, now))
     return best.verdict is Verdict.AGREES and 0.25 * now.count * math.log(left_now / max(left, 1e-6)) > _MUCH_LIKELIER

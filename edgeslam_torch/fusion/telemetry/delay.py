@@ -12,23 +12,22 @@ from edgeslam_torch.fusion.telemetry.visual_memory import Displacements, VisualM
 from edgeslam_torch.types import FloatArray
 
 _MIN_DISPLACEMENTS = 8
-"""Minimum number of displacements: found with so few, 1.2 stated sigmas off (rms of 32 cases, at most 2.7); with 6 some
-were 6 sigmas off."""
+"""Minimum number of displacements: the error then is 1.2 sigma RMS, at most 2.7; with six it reached 6 sigma."""
 GROWTH = 1.3
 """Growth of the data after which the search is repeated."""
 _GUESS_S = 0.5
-"""Initial value, in the middle of measured Tello delays (0.3 to 0.8 s)."""
+"""Initial value: the middle of measured Tello delays (0.3 to 0.8 s)."""
 _STEP_S = 0.05
 _MARGIN_S = 0.1
-"""Searched and used beyond the configured range, so that a delay at its end is found, and one beyond that is seen to be
-outside by `comparison`, which steps by as much."""
+"""Margin of the search around the configured range, so that a delay at its end is an interior minimum, and
+`comparison`, which uses the same step, detects one beyond."""
 _MOST_SIGMA_S = 0.05
 _VALLEY_S = 0.15
 _CLEARLY = 6.0
-"""Log likelihood by which a second valley must be worse."""
+"""Minimum log-likelihood ratio to the second-best local minimum."""
 _CLOCK_SIGMA_S = 0.005
 _KEPT = 0.9
-"""Share of the residuals used: one in ten may be an outlier."""
+"""Share of the residuals used; the rest may be outliers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +36,11 @@ class Delay:
 
     value_s: float
     sigma_s: float
-    """Infinite while it is a guess, 0 when configured."""
+    """Infinite for the initial value, 0 when configured."""
 
 
 class DelaySearch:
-    """Keeps the delay, and searches again as evidence grows."""
+    """The current delay; the search is repeated as data grow."""
 
     def __init__(self, config: FusionConfig, R_b_c: FloatArray) -> None:
         self._config, self._R_b_c = config, R_b_c
@@ -50,7 +49,8 @@ class DelaySearch:
         self._tried_at = 0
 
     def search(self, memory: VisualMemory, track: TelemetryTrack) -> None:
-        """Delay at which visual and telemetry displacements and turns agree best; kept where none stands out."""
+        """Find the delay at which visual and telemetry displacements and rotations agree best; unchanged if it is
+        ambiguous."""
         n = memory.count
         if self._config.delay_s is not None or n < _MIN_DISPLACEMENTS or n < GROWTH * self._tried_at:
             return
@@ -69,7 +69,7 @@ class DelaySearch:
             self.delay = Delay(value_s, math.hypot(found.sigma_s, _CLOCK_SIGMA_S))
 
     def _cost(self, delay_s: float, moved: Displacements, memory: VisualMemory, track: TelemetryTrack) -> float:
-        """Misfit of displacements (log-likelihood with the residual's own spread) and of rotations."""
+        """Negative log-likelihood of displacements, with the residuals' own variance, and of rotations."""
         R_w_m = map_to_world(memory.sightings(), track, delay_s, self._R_b_c)
         if R_w_m is None:
             return math.inf
@@ -85,10 +85,10 @@ class DelaySearch:
         return cost + self._turn_cost(moved, track)
 
     def _turn_cost(self, moved: Displacements, track: TelemetryTrack) -> float:
-        """Log-likelihood of the turns with their own spread.
+        """Negative log-likelihood of the rotations with the residuals' own variance.
 
-        An attitude between two readings is less noisy than one at a reading. Unless that is allowed for, the best delay
-        is one that puts all intervals between readings: 0.04 s wrong at 10 Hz whatever the flight.
+        An interpolated attitude is less noisy than a reading. Without a correction the best delay is one that puts all
+        intervals between readings, a bias of up to 0.04 s at 10 Hz.
         """
         both = turns(moved, track, self._R_b_c)
         trace = np.einsum("nij,nij->n", both.seen, both.told)
@@ -100,7 +100,7 @@ class DelaySearch:
 
 
 def _least(delays_s: FloatArray, cost: FloatArray) -> Delay | None:
-    """The minimum between the steps, if it is inside, sharp and alone."""
+    """Sub-step minimum, if it is inside the range, sharp and unique."""
     best = int(np.argmin(cost))
     if not math.isfinite(cost[best]) or best in (0, len(delays_s) - 1):
         return None

@@ -1,8 +1,7 @@
-"""Metres per map unit around one moment of the flight, from the seconds before and after it alone.
+"""Metres per map unit around one moment of the flight, from the seconds before and after it.
 
 The scale of a whole flight (`fusion/telemetry_scale.py`) is that of the present map. A monocular map drifts in scale,
-so two places that it holds may have two scales; velocities of either time tell by how much they differ, whatever
-happened on the way.
+so that two places in it may differ; local velocities measure the difference.
 """
 
 import math
@@ -17,14 +16,14 @@ from edgeslam_torch.fusion.telemetry.visual_memory import Displacements
 from edgeslam_torch.types import FloatArray, ScaleEstimate
 
 AROUND_S = 5.0
-"""Time before and after the moment that is looked at: four metres each at an indoor drone's speed."""
+"""Time before and after the moment: four metres each at an indoor drone's speed."""
 MOST_SIGMA = 0.15
-"""Relative standard deviation beyond which such a short part tells nothing."""
+"""Maximum relative standard deviation of a local scale."""
 LEAST_SIGMA = 0.03
-"""The least: a map that drifts does so within these seconds, too."""
+"""Lower bound of the standard deviation: drift within the window."""
 _SIGMAS, _SAID_LOG = 3.0, math.log(1.15)
-"""Difference of two parts of a flight beyond which it is said: no chance, and more than whole steps of velocity and a
-bend of the map make of the same scale."""
+"""Minimum significance and size of a reported difference: above the effect of quantised velocities and map
+distortion."""
 
 
 def scale_around(
@@ -37,7 +36,7 @@ def scale_around(
     config: FusionConfig,
     shortfall_m_s: float = 0.0,
 ) -> ScaleEstimate | None:
-    """Metres per map unit within `AROUND_S` of a moment; None where velocities do not tell it.
+    """Metres per map unit within `AROUND_S` of a moment; None where velocities do not determine it.
 
     Args:
         moved: Visual displacements of the flight, by the stamps of frames.
@@ -46,8 +45,8 @@ def scale_around(
         delay_s: Video delay behind telemetry.
         R_w_m: Map axes to telemetry's world ``(3, 3)``.
         T_b_c: Camera to body ``(4, 4)`` [m].
-        config: Noise of velocities, and the least speed that tells.
-        shortfall_m_s: How much every velocity that is not zero reads low.
+        config: Noise of velocities, and the minimum speed.
+        shortfall_m_s: Expected truncation loss of every non-zero velocity.
     """
     near = (moved.from_s >= stamp_s - AROUND_S) & (moved.to_s <= stamp_s + AROUND_S)
     return scale_of(moved.only(near), track, delay_s, R_w_m, T_b_c, config, shortfall_m_s)
@@ -62,7 +61,7 @@ def scale_of(
     config: FusionConfig,
     shortfall_m_s: float,
 ) -> ScaleEstimate | None:
-    """Metres per map unit by some displacements; arguments as for `scale_around`."""
+    """Metres per map unit along some displacements; arguments as for `scale_around`."""
     moved = moved.on_telemetry_clock(delay_s)
     moved = moved.only(track.covered(moved.from_s, moved.to_s))
     if not len(moved):
@@ -84,11 +83,11 @@ def scale_of(
 
 
 def drift_in_words(scale_at: Callable[[float], ScaleEstimate | None], from_s: float, to_s: float) -> str | None:
-    """That an earlier part of the map has another scale than the present one, if telemetry is sure; None otherwise.
+    """Warning that an earlier part of the map differs significantly in scale from the present one; None otherwise.
 
     Args:
         scale_at: Metres per map unit around a moment.
-        from_s: Oldest moment of which something is remembered.
+        from_s: Oldest stored moment.
         to_s: The present.
     """
     now = scale_at(to_s - AROUND_S)

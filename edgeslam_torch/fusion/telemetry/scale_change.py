@@ -1,7 +1,7 @@
-"""By how much refinement has enlarged what is remembered: metres per map unit shrink by as much.
+"""Change of the map's scale by refinement: metres per map unit change by the inverse.
 
-A map's unit is free, and every refinement may change it by a percent. A scale is fitted to telemetry every few seconds
-only; between two fits it goes along with the map.
+A map's unit is free, and each refinement may change it by a percent. The scale is fitted to telemetry only every few
+seconds and follows the map in between.
 """
 
 import math
@@ -12,18 +12,18 @@ from edgeslam_torch.fusion.telemetry.visual_memory import Displacements
 from edgeslam_torch.types import FloatArray
 
 REACH_S = 30.0
-"""Age of poses that are looked at."""
+"""Maximum age of the poses compared."""
 _SETTLED_S = 5.0
-"""Age below which a window still mends single poses, which says nothing of the unit: ten keyframes at two a second."""
+"""Age below which a window still refines single poses, independently of the unit: ten keyframes at two a second."""
 _LEAST_COUNT, _LEAST_SIGMAS = 4, 5.0
-"""Displacements that must tell, and their length in standard deviations: shorter ones are noise in both."""
+"""Minimum number of displacements, and their minimum length in standard deviations."""
 
 
 def grown(before: Displacements, after: Displacements, now_s: float) -> float:
-    """Size of the map now over its size before; 1 where too little has moved to tell, or the map is no map any more.
+    """Present size of the map over its previous size; 1 with too little motion, or after a degenerate update.
 
     Args:
-        before: Displacements as they were.
+        before: Displacements before the refinement.
         after: The same, refined.
         now_s: Stamp of the newest frame.
 
@@ -42,7 +42,7 @@ def grown(before: Displacements, after: Displacements, now_s: float) -> float:
 
 
 def _middle(ratio: FloatArray, weight: FloatArray) -> float:
-    """Weighted median: a new unit enlarges all displacements alike; what was mended changes a few, and by much."""
+    """Weighted median: a change of unit scales all displacements equally; local corrections change few, by much."""
     order = np.argsort(ratio)
     up_to = np.cumsum(weight[order])
     return float(ratio[order][np.searchsorted(up_to, 0.5 * up_to[-1])])

@@ -1,8 +1,7 @@
-"""Whether a map still changes its scale: refinement that moves what was mapped before will move it again.
+"""Convergence of the map's scale: recent changes by refinement predict further ones.
 
-In its first seconds a map holds few keyframes, and each refinement may rescale all of it, most where there is little to
-see. A scale told by then is right for the map as it was, and metres published with it are wrong a second later. It
-shows in how much the remembered path has changed its size within the last second.
+In its first seconds a map has few keyframes, and each refinement may rescale all of it, most with few features. A scale
+fitted then is soon outdated. The indicator is the change in size of the stored path within the last second.
 """
 
 import math
@@ -13,14 +12,14 @@ from edgeslam_torch.fusion.telemetry.visual_memory import Sightings
 from edgeslam_torch.types import FloatArray
 
 _MEMORY_S = 1.0
-"""Time in which a change is forgotten: a window's keyframes are older then."""
+"""Decay time of a change: after it a window's keyframes have been replaced."""
 _WINDOW_S = 5.0
-"""Age of poses beyond which they tell nothing of the present scale."""
+"""Maximum age of poses that constrain the present scale."""
 _TO_COME = 1.3
-"""How much more the scale changes, as a share of what it has changed within the last second (root mean square)."""
+"""Expected further change of the scale over its change within the last second (RMS)."""
 _LEAST_POSES = 5
 _LEAST_SIZE = 10.0
-"""Size of the path in standard deviations of a pose, below which its change is noise."""
+"""Minimum size of the path in standard deviations of a pose; below, its change is noise."""
 
 
 class ScaleConvergence:
@@ -33,17 +32,17 @@ class ScaleConvergence:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of what the log scale may still change."""
+        """Standard deviation of the expected further change of the log scale."""
         return _TO_COME * self._most
 
     def compare(self, before: Sightings, after: Sightings, now_s: float) -> None:
-        """Take in a refinement.
+        """Update with a refinement.
 
         Args:
-            before: Remembered poses as they were.
+            before: Stored poses before it.
             after: The same poses refined.
-            now_s: Stamp of the newest frame. Frames after the last comparison's are left out: their tracked poses
-                change as well, which says nothing of the map.
+            now_s: Stamp of the newest frame. Frames since the last comparison are ignored: their tracked poses change
+                independently of the map.
         """
         settled = (before.stamps_s <= self._at_s) & (before.stamps_s > self._at_s - _WINDOW_S)
         kept = math.exp(-max(0.0, now_s - self._at_s) / _MEMORY_S) if math.isfinite(self._at_s) else 0.0
@@ -57,5 +56,5 @@ class ScaleConvergence:
 
 
 def _size(p: FloatArray) -> float:
-    """Root mean square distance of points ``(N, 3)`` from their mean."""
+    """RMS distance of points ``(N, 3)`` from their mean."""
     return float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))

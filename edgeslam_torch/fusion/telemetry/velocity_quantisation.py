@@ -1,13 +1,13 @@
-r"""What is lost where a drone tells its velocity in whole steps, expected from the motion that the images show.
+r"""Expected quantisation loss of velocity readings, from the visual motion.
 
-A Tello drops what is beyond a whole dm/s, so every reading is 0 to 1 step low, and below one step it reads nothing at
-all. How much that is in the mean depends on the speeds that were flown. Vision knows these but for the scale :math:`s`:
-of a reading at the visual velocity :math:`u` the remainder
+A Tello truncates to 0.1 m/s: every reading is 0 to 1 step low, and speeds below one step read as zero. The mean loss
+depends on the speed, which vision measures up to the scale :math:`s`. For a reading at the visual velocity :math:`u`
+the expected remainder is
 
 .. math:: r(s u) = s u - E[Q(s u + n)], \qquad n \sim N(0, \sigma^2)
 
-is expected to be missing, with :math:`Q` rounding or truncation and :math:`\sigma` the noise before it. Velocities with
-their remainders added give a scale, and that scale other remainders: a fixed point, see `remainder_gain`.
+with rounding or truncation :math:`Q` and noise :math:`\sigma` before it. Velocities plus remainders give a scale, which
+gives other remainders: a fixed point, see `remainder_gain`.
 """
 
 import math
@@ -23,19 +23,19 @@ from edgeslam_torch.fusion.telemetry.visual_memory import Displacements, Sightin
 from edgeslam_torch.types import FloatArray
 
 _NOISE_STEPS = 0.4
-"""Noise of a velocity before it is rounded, in steps: 0.02 to 0.03 m/s of the sensor, and 0.03 to 0.04 m/s of vision
-over a tenth of a second (fr1_xyz, redkitchen, euroc_mh05_a)."""
+"""Noise of a velocity before quantisation [steps]: 0.02 to 0.03 m/s of the sensor, and 0.03 to 0.04 m/s of vision over
+a tenth of a second."""
 _HALF_S = 0.05
-"""Half the time over which one reading is a mean."""
+"""Half the averaging time of one reading."""
 _FEW_STEPS, _FINE = 4.0, 0.02
-"""Beyond so many steps the remainder is constant; grid below."""
+"""Speed above which the remainder is constant, and resolution of the grid below [steps]."""
 _MOST_GAIN = 0.9
 _PROBE = 0.05
-"""Relative change of the scale by which the gain is measured."""
+"""Relative change of the scale for the numeric derivative."""
 
 
 class Rounding(StrEnum):
-    """How a velocity is made whole steps."""
+    """Quantisation mode of a velocity."""
 
     NEAREST = "nearest"
     TRUNCATE = "truncate"
@@ -43,13 +43,13 @@ class Rounding(StrEnum):
 
 @lru_cache(maxsize=2)
 def _table(rounding: Rounding) -> tuple[FloatArray, FloatArray]:
-    """Speeds from 0 up, and the remainder expected at each, in steps."""
+    """Speeds from 0 up, and the expected remainder at each [steps]."""
     speed = np.arange(0.0, _FEW_STEPS + 0.5 * _FINE, _FINE)
     first = 1.0 if rounding is Rounding.TRUNCATE else 0.5
     edges = first + np.arange(_FEW_STEPS + 4.0)
 
     def passed(x: FloatArray) -> FloatArray:
-        """Expected number of edges that ``x`` and noise are beyond."""
+        """Expected number of quantisation thresholds below ``x`` plus noise."""
         z = (x[:, None] - edges) / (_NOISE_STEPS * math.sqrt(2.0))
         return np.array([[0.5 * math.erfc(-v) for v in row] for row in z.tolist()]).sum(axis=1)
 
@@ -57,32 +57,32 @@ def _table(rounding: Rounding) -> tuple[FloatArray, FloatArray]:
 
 
 def remainder(velocity_steps: FloatArray, rounding: Rounding) -> FloatArray:
-    """Expected true velocity less its reading [steps], for true velocities [steps] of any shape."""
+    """Expected true minus reported velocity [steps], for true velocities [steps] of any shape."""
     speed, lost = _table(rounding)
     return np.asarray(np.sign(velocity_steps) * np.interp(np.abs(velocity_steps), speed, lost))
 
 
 @dataclass(frozen=True, slots=True)
 class SeenVelocity:
-    """The images' velocity at each reading of telemetry; ``S`` readings."""
+    """Visual velocity at each telemetry reading; ``S`` readings."""
 
     stamp_s: FloatArray
     """``(S,)`` of the readings."""
     camera: FloatArray
-    """``(S, 3)`` in the axes in which the drone tells its velocity [map units/s]; zero where vision was blind."""
+    """``(S, 3)`` in the axes of the velocity readings [map units/s]; zero without vision."""
     lever: FloatArray
-    """``(S, 3)`` of the camera about the body, the same axes [m/s]."""
+    """``(S, 3)`` of the camera relative to the body, the same axes [m/s]."""
     R_w: FloatArray
     """``(S, 3, 3)`` these axes to the power-on world."""
 
     def lost(self, at_s: FloatArray, scale: float, step_m_s: float, rounding: Rounding) -> FloatArray:
-        """Integrated remainder ``(N, 3)`` [m] at times ``(N,)``, in the power-on world; only differences mean anything.
+        """Integrated remainder ``(N, 3)`` [m] at times ``(N,)``, in the power-on world; only differences matter.
 
         Args:
             at_s: Times on telemetry's clock.
             scale: Metres per map unit.
-            step_m_s: The step.
-            rounding: What the drone does.
+            step_m_s: Quantisation step.
+            rounding: Quantisation mode.
         """
         body = (scale * self.camera - self.lever) / step_m_s
         rate = step_m_s * np.einsum("swa,sa->sw", self.R_w, remainder(body, rounding))
@@ -94,7 +94,7 @@ class SeenVelocity:
 def seen_velocity(
     track: TelemetryTrack, seen: Sightings, delay_s: float, R_w_m: FloatArray, T_b_c: FloatArray, max_gap_s: float
 ) -> SeenVelocity:
-    """Velocity of the camera at each reading, from the sightings around it.
+    """Velocity of the camera at each reading, interpolated from the tracked poses.
 
     Args:
         track: Telemetry, with two readings at least.
@@ -102,7 +102,7 @@ def seen_velocity(
         delay_s: Video delay behind telemetry.
         R_w_m: Map axes to the power-on world ``(3, 3)``.
         T_b_c: Camera in the body ``(4, 4)``.
-        max_gap_s: A longer hole between sightings is not bridged.
+        max_gap_s: Maximum gap between poses for interpolation.
     """
     stamp = track.readings.stamp_s
     shown_s = stamp + delay_s
@@ -123,7 +123,7 @@ def _mean_velocity(stamp_s: FloatArray, p: FloatArray, at_s: FloatArray) -> Floa
 
 
 def _bridged(stamp_s: FloatArray, at_s: FloatArray, max_gap_s: float) -> NDArray[np.bool_]:
-    """Whether a time lies between two sightings that belong together."""
+    """Whether a time lies between two poses without a gap."""
     after = np.clip(np.searchsorted(stamp_s, at_s), 1, len(stamp_s) - 1)
     inside = (at_s >= stamp_s[0]) & (at_s <= stamp_s[-1])
     return np.asarray(inside & (stamp_s[after] - stamp_s[after - 1] < max_gap_s))
@@ -132,18 +132,18 @@ def _bridged(stamp_s: FloatArray, at_s: FloatArray, max_gap_s: float) -> NDArray
 def remainder_gain(
     shown: SeenVelocity, moved: Displacements, R_w_m: FloatArray, scale: float, step_m_s: float, rounding: Rounding
 ) -> float:
-    """How much of a change of the scale the remainders follow, in 0 (fast flight) to 0.9 (nearly all below a step).
+    """Derivative of the scale implied by the remainders, from 0 (fast flight) to 0.9 (nearly all below a step).
 
-    Where a flight is slow, most of its motion is remainder, and that is the images' own at the assumed scale: it
-    confirms whatever was assumed. The fixed point then is 1 / (1 - gain) times as uncertain as the fit.
+    In slow flight most of the motion is remainder, computed from vision at the assumed scale, so that it confirms any
+    scale. The fixed point is 1 / (1 - gain) times as uncertain as the fit.
 
     Args:
-        shown: Vision's velocity at the readings.
-        moved: Intervals that the scale is fitted to, on telemetry's clock.
+        shown: Visual velocity at the readings.
+        moved: Intervals of the fit, on telemetry's clock.
         R_w_m: Map axes to the power-on world ``(3, 3)``.
         scale: Metres per map unit.
-        step_m_s: The step.
-        rounding: What the drone does.
+        step_m_s: Quantisation step.
+        rounding: Quantisation mode.
     """
     ends = np.concatenate([moved.from_s, moved.to_s])
     n = len(moved)

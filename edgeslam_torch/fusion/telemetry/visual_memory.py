@@ -1,4 +1,4 @@
-"""What vision said of the last minutes: poses at some 10 Hz, and displacements over half seconds."""
+"""Visual poses of the last minutes at about 10 Hz, and displacements over half seconds."""
 
 import math
 from collections import deque
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from edgeslam_torch.types import FloatArray
 
 _SIGHTING_S = 0.09
-"""Minimum time between the poses kept: telemetry comes every 0.1 s."""
+"""Minimum time between stored poses: telemetry comes every 0.1 s."""
 _FEW = 4
-"""Recent poses below which their mean is not asked for: a second of flight."""
+"""Minimum number of recent poses for a mean: a second of flight."""
 _MANY_DISPLACEMENTS = 16
-"""Number of displacements, eight seconds of them, from which on pairs are joined to intervals of a second."""
+"""Number of displacements from which on pairs are merged to intervals of a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +31,11 @@ class VisualPose:
     sigma_r_rad: float
 
     def moved(self, T: FloatArray) -> "VisualPose":
-        """The same in a map that was moved by ``T`` ``(4, 4)``."""
+        """The pose in a map transformed by ``T`` ``(4, 4)``."""
         return replace(self, T=T @ self.T)
 
     def revised(self, known: dict[float, FloatArray]) -> "VisualPose":
-        """The same frame at its refined pose, where that is known."""
+        """The refined pose of this frame, if there is one."""
         T = known.get(self.stamp_s)
         return self if T is None else replace(self, T=T)
 
@@ -51,7 +51,7 @@ class _Interval:
 
 @dataclass(frozen=True, slots=True)
 class Displacements:
-    """Visual motion over intervals that do not overlap; ``N`` of them."""
+    """Visual motion over disjoint intervals; ``N`` of them."""
 
     from_s: FloatArray
     """``(N,)``"""
@@ -75,19 +75,19 @@ class Displacements:
         return self.to_s - self.from_s
 
     def only(self, use: NDArray[np.bool_]) -> "Displacements":
-        """Those that may be used."""
+        """The selected intervals."""
         fields = (self.from_s, self.to_s, self.moved, self.sigma, self.R_from, self.R_to)
         return Displacements(*(x[use] for x in fields))
 
     def on_telemetry_clock(self, delay_s: float) -> "Displacements":
-        """The same intervals as telemetry stamped them, for a video that is ``delay_s`` late."""
+        """The same intervals on telemetry's clock, for a video delay of ``delay_s``."""
         return replace(self, from_s=self.from_s - delay_s, to_s=self.to_s - delay_s)
 
     def joined(self) -> "Displacements":
-        """Two neighbours made one once there are many.
+        """Neighbours merged in pairs once there are many.
 
-        Over half a second a map's own errors are a tenth of the displacement and more, and noise in the regressor
-        biases the scale towards zero; over a second they have hardly grown, and the displacement has doubled.
+        Over half a second map errors are a tenth of the displacement and more, and noise in the regressor biases the
+        scale towards zero; over a second they have hardly grown, and the displacement has doubled.
         """
         if len(self) < _MANY_DISPLACEMENTS:
             return self
@@ -105,7 +105,7 @@ class Displacements:
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """Tracked poses at some 10 Hz; ``S`` of them."""
+    """Tracked poses at about 10 Hz; ``S`` of them."""
 
     stamps_s: FloatArray
     """``(S,)``"""
@@ -116,12 +116,12 @@ class Sightings:
 
 
 class VisualMemory:
-    """Poses of tracked frames, in the map's gauge, for as long as they tell something.
+    """Poses of tracked frames, in the map's gauge.
 
     Args:
         interval_s: Length of one displacement.
-        window_s: What is older is forgotten.
-        max_gap_s: A longer hole in tracking ends a displacement.
+        window_s: Maximum age.
+        max_gap_s: Gap in tracking that ends a displacement.
     """
 
     def __init__(self, interval_s: float, window_s: float, max_gap_s: float) -> None:
@@ -129,7 +129,7 @@ class VisualMemory:
         self._intervals: deque[_Interval] = deque(maxlen=max(20, int(window_s / interval_s)))
         self._sightings: deque[VisualPose] = deque(maxlen=int(10 * window_s))
         self._start: VisualPose | None = None
-        """Where the present displacement begins."""
+        """Start of the current displacement."""
         self.began_s = math.inf
         """Stamp of the first tracked frame."""
         self.last: VisualPose | None = None
@@ -140,7 +140,7 @@ class VisualMemory:
         self._shown: Sightings | None = None
 
     def add(self, visual: VisualPose) -> None:
-        """A tracked frame, newer than all before."""
+        """Add a tracked frame, newer than all before."""
         last = self.last
         self.began_s = min(self.began_s, visual.stamp_s)
         gap = last is None or visual.stamp_s - last.stamp_s > self._max_gap_s
@@ -157,16 +157,17 @@ class VisualMemory:
             self._displacements = None
 
     def interrupt(self) -> None:
-        """Tracking was lost: what follows does not continue what was before."""
+        """End the current displacement: tracking was lost."""
         self._start = self.previous = None
 
     def revise(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
-        """Refined poses ``(F, 4, 4)`` of frames by their stamps ``(F,)``; others are left alone."""
+        """Replace poses by refined ones ``(F, 4, 4)`` with stamps ``(F,)``; others are unchanged."""
         known = dict(zip(stamps_s.tolist(), T_w_c, strict=True))
         self._each(lambda visual: visual.revised(known))
 
     def move_newest(self, T: FloatArray) -> None:
-        """The map around the newest frames was moved by ``T`` ``(4, 4)``: ``T_w_c' = T T_w_c``; older ones stay."""
+        """Transform the newest poses with the map around them: ``T_w_c' = T T_w_c``, ``(4, 4)``; older ones are
+        unchanged."""
         self.last, self.previous = (None if v is None else v.moved(T) for v in (self.last, self.previous))
 
     def _each(self, change: Callable[[VisualPose], VisualPose]) -> None:
@@ -185,11 +186,11 @@ class VisualMemory:
 
     @property
     def length_s(self) -> float:
-        """Time from the oldest to the newest remembered pose."""
+        """Time from the oldest to the newest stored pose."""
         return self.last.stamp_s - self._sightings[0].stamp_s if self.last is not None else 0.0
 
     def displacements(self) -> Displacements:
-        """All of them as arrays."""
+        """All displacements as arrays."""
         if self._displacements is None:
             starts, ends = ([getattr(i, which) for i in self._intervals] for which in ("start", "end"))
             T_from, T_to = (np.array([v.T for v in poses]).reshape(-1, 4, 4) for poses in (starts, ends))
@@ -204,17 +205,17 @@ class VisualMemory:
         return self._displacements
 
     def recent(self, since_s: float) -> Sightings | None:
-        """Every third of those since a stamp, as arrays; None where they are too few for a mean."""
+        """Every third pose since a stamp, as arrays; None with too few for a mean."""
         newest_first = takewhile(lambda v: v.stamp_s >= since_s, reversed(self._sightings))
         some = list(islice(newest_first, 0, None, 3))
         return _arrays(some) if len(some) >= _FEW else None
 
     def newest(self, count: int) -> Sightings:
-        """So many at most, in order, as arrays."""
+        """At most ``count`` newest poses in order, as arrays."""
         return _arrays(list(islice(reversed(self._sightings), count))[::-1])
 
     def sightings(self) -> Sightings:
-        """All of them as arrays."""
+        """All poses as arrays."""
         if self._shown is None:
             self._shown = _arrays(self._sightings)
         return self._shown
