@@ -1,1 +1,1 @@
-"""Metres per map unit: what each source says, how sure it is, and which of them count."""
+"""Metric scale: estimates of each source, their uncertainty, and consensus between them."""

@@ -1,4 +1,4 @@
-"""How the camera sits on the drone, from a flight: the same turns in camera and in body axes."""
+"""Orientation of the camera on the drone, from rotations observed in camera and body axes."""
 
 import math
 from dataclasses import dataclass
@@ -10,46 +10,47 @@ from edgeslam_torch.geometry.rotations import mean_rotation
 from edgeslam_torch.types import FloatArray
 
 _ATTITUDE_RAD, _ATTITUDE_MEMORY_S = math.radians(1.0), 5.0
-"""Error of roll and pitch of a drone that speeds up and slows down, and how long one lasts."""
+"""Error of roll and pitch under acceleration, and its correlation time."""
 _BENT_RAD = math.radians(1.0)
-"""By how much a map's own axes change from place to place."""
+"""Variation of a map's orientation from place to place."""
 _STEPS = 3
-"""Of Gauss and Newton: rotations of some degrees are nearly linear."""
+"""Gauss-Newton iterations: rotations of some degrees are nearly linear."""
 
 
 @dataclass(frozen=True, slots=True)
 class Turned:
-    """How camera and map are turned against the drone and its world."""
+    """Rotations of camera and map relative to the drone and its world."""
 
     R_b_c: FloatArray
     """``(3, 3)`` camera to body."""
     R_w_m: FloatArray
     """``(3, 3)`` map to the power-on world."""
     sigma_rad: FloatArray
-    """``(3,)`` how far ``R_w_m`` may be off, about the world's axes."""
+    """``(3,)`` standard deviation of ``R_w_m`` about the world's axes."""
 
 
 def mount_by_turns(
     R_m_c: FloatArray, R_w_b: FloatArray, stamps_s: FloatArray, R_b_c: FloatArray, sigma_rad: float
 ) -> Turned:
-    """Rotations that let attitude turn as the images do (robot-world and hand-eye calibration).
+    """Robot-world and hand-eye calibration of rotations.
 
-    ``R_w_m R_m_c = R_w_b R_b_c`` holds in all pictures, with both ``R_w_m`` and ``R_b_c`` unknown: where a drone turns,
-    a lean of its camera goes round with it, a lean of the map does not. What no turn tells stays as it was given.
+    ``R_w_m R_m_c = R_w_b R_b_c`` holds in all frames with both ``R_w_m`` and ``R_b_c`` unknown. Yaw makes them
+    observable: a tilt of the camera rotates with the drone, a tilt of the map does not. Unobservable components stay at
+    the prior.
 
     Args:
         R_m_c: Cameras in the map ``(N, 3, 3)``.
-        R_w_b: The drone's attitude then ``(N, 3, 3)``.
+        R_w_b: The drone's attitude at the same times ``(N, 3, 3)``.
         stamps_s: Increasing stamps ``(N,)``.
-        R_b_c: Camera to body as it was given ``(3, 3)``.
-        sigma_rad: How far off that may be, per axis.
+        R_b_c: Configured camera to body ``(3, 3)``.
+        sigma_rad: Its standard deviation per axis.
     """
     memory_s = 0.5 * _ATTITUDE_MEMORY_S
     alike = np.searchsorted(stamps_s, stamps_s + memory_s, "right") - np.searchsorted(stamps_s, stamps_s - memory_s)
     weight = 1.0 / (_ATTITUDE_RAD**2 * alike)
     R_w_m = mean_rotation(R_w_b @ R_b_c @ np.swapaxes(R_m_c, 1, 2))
     R_b_w = np.swapaxes(R_w_b, 1, 2)
-    J = np.concatenate([R_b_w, np.broadcast_to(-np.eye(3), R_b_w.shape)], axis=2)  # of the turns of R_w_m and R_b_c
+    J = np.concatenate([R_b_w, np.broadcast_to(-np.eye(3), R_b_w.shape)], axis=2)  # by rotations of R_w_m, R_b_c
     weighted = np.einsum("nai,n->ain", J, weight)
     prior = np.diag([0.0] * 3 + [sigma_rad**-2] * 3)
     covariance = np.linalg.inv(np.einsum("ain,naj->ij", weighted, J) + prior)

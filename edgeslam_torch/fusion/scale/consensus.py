@@ -1,10 +1,9 @@
-"""Consensus of contradicting scale estimates: which are used, and warnings about the others.
+"""Consensus of contradictory scale estimates.
 
-The average of a right estimate and a wrong one is wrong. So opinions further apart than `CONTRADICTION` sigmas are
-not averaged; the one with the worse evidence is dropped. The depth network's is always worse than that of the drone's
-sensors where these confirm each other: all its keyframes share one error, whereas displacements and heights are many
-independent measurements. One sensor alone may be in the wrong unit. Where that or a useless network are the two ways to
-explain what is seen, neither is used.
+The average of a right estimate and a wrong one is wrong, so estimates further apart than `CONTRADICTION` sigmas are not
+averaged; the one with weaker evidence is rejected. The depth network is weaker than sensors that confirm each other:
+its error is common to all keyframes, whereas displacements and heights are many independent measurements. A single
+sensor may be in the wrong unit. If that and a wrong network are both plausible, neither is used.
 """
 
 import math
@@ -13,21 +12,21 @@ from dataclasses import dataclass
 from edgeslam_torch.fusion.scale.log_scale import LogScale
 
 CONTRADICTION = 3.0
-"""Sigmas of the difference; right opinions are that far apart in 0.3 % of the cases."""
+"""Maximum difference of consistent estimates [sigmas], exceeded by chance in 0.3 % of the cases."""
 _AT_ODDS = 5.0
 AT_ODDS_LOG = math.log(1.5)
-"""Sigmas and factor between two opinions beyond which one of them is nonsense."""
+"""Difference in sigmas and factor beyond which one of two estimates is a gross error."""
 _WRONG_UNIT_LOG = 0.5 * math.log(10.0)
-"""Units of velocity differ by tens: beyond half of that a wrong unit explains a contradiction better than any error."""
+"""Half a decade: beyond it a wrong unit of velocity (a power of ten) is the most likely cause of a contradiction."""
 
 
 def contradict(a: LogScale, b: LogScale) -> bool:
-    """Whether two opinions are too far apart to be averaged."""
+    """Whether two estimates are too far apart to be averaged."""
     return _apart(a, b) > CONTRADICTION * math.hypot(a.sigma, b.sigma)
 
 
 def at_odds(a: LogScale, b: LogScale) -> bool:
-    """Whether one of two opinions must be nonsense, not merely off by more than it says."""
+    """Whether one of two estimates must be a gross error, not merely overconfident."""
     return _apart(a, b) > max(AT_ODDS_LOG, _AT_ODDS * math.hypot(a.sigma, b.sigma))
 
 
@@ -36,7 +35,7 @@ def _apart(a: LogScale, b: LogScale) -> float:
 
 
 def sided_with(one: LogScale, other: LogScale, witness: LogScale | None) -> LogScale | None:
-    """Which of two contradictory opinions a third confirms; ``None`` when it confirms neither or both, or is none."""
+    """Which of two contradictory estimates a third supports; ``None`` if it supports neither or both, or is missing."""
     if witness is None:
         return None
     fits = [opinion for opinion in (one, other) if not contradict(opinion, witness)]
@@ -45,20 +44,20 @@ def sided_with(one: LogScale, other: LogScale, witness: LogScale | None) -> LogS
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """Estimates of drone and network that remain."""
+    """Estimates of drone and network that are used."""
 
     used: tuple[LogScale, ...]
     warning: str | None = None
-    """Warning about dropped estimates."""
+    """Warning about rejected estimates."""
 
 
 def settled_with_network(told: LogScale | None, network: LogScale | None, in_domain: bool) -> Settled:
-    """Opinions of the drone's sensors and of the depth network or an atlas, less those that must be wrong.
+    """Reject contradictory estimates of the drone's sensors and of the depth network or an atlas.
 
     Args:
         told: By velocities, heights or both.
-        network: By the depth network, or by the atlas in whose metres it had its part.
-        in_domain: Whether the network may tell metres at all; if not, it may still contradict nonsense.
+        network: By the depth network, or by an atlas, whose metres include the network's estimate.
+        in_domain: Whether the network may determine the scale; otherwise it only serves to detect gross errors.
     """
     if told is None or network is None:
         return Settled(tuple(o for o in (told, network if in_domain else None) if o is not None))

@@ -1,15 +1,15 @@
 r"""Metric scale from the depth network, with its uncertainty.
 
 Each keyframe gives the median of log (network depth [m] / map depth [map units]) over its triangulated anchors. All
-keyframes of a scene share the network's error, so the mean of their ratios is not more certain than the network for
-the scene. That uncertainty is inferred from the keyframes: by the slope :math:`b` of log network depth on log map
-depth inside a keyframe (1: the network follows depth; 0: it predicts a constant), by the spread :math:`s` of
-single anchors around their keyframe's ratio, and by how much the ratios wander, :math:`w`, from keyframe to keyframe:
+keyframes of a scene share the network's error, so averaging their ratios does not reduce it. It is predicted from the
+keyframes: from the slope :math:`b` of log network depth on log map depth inside a keyframe (1: the network follows
+depth; 0: it predicts a constant), the spread :math:`s` of single anchors around their keyframe's ratio, and the
+variation :math:`w` of the ratios between keyframes:
 
 .. math:: \sigma^2 = \sigma_0^2 + a_b^2 (1 - b)^2 + a_s^2 s^2 + a_w^2 w^2
 
-The coefficients are fitted to the true errors over recordings, simulated flights and spoilt images of both
-(docs/decisions/21-depth-sigma.md). Where the sum is too large the network is out of its domain.
+The coefficients are fitted to the true errors over recordings, simulated flights and degraded images of both
+(docs/decisions/21-depth-sigma.md). Above a maximum of the sum the network is out of its domain.
 """
 
 import math
@@ -24,27 +24,27 @@ from edgeslam_torch.types import FloatArray
 SLOPE_SIGMA = 0.4
 SPREAD_SIGMA = 2.0
 WANDER_SIGMA = 1.0
-"""Log error of the scale per unit of missing slope, of spread and of wandering."""
+"""Log error of the scale per unit of missing slope, of spread and of variation between keyframes."""
 
 MOST_SIGMA = 0.5
-"""Beyond it the scale is no measurement: two sigmas are a factor of e each way, which is a cupboard or a hall."""
+"""Maximum sigma of a usable scale: at two sigmas, a factor of e each way."""
 
 _MAP_NOISE_LOG = 0.05
-"""Error of triangulated depth: in a scene of one depth the slope is not taken from noise but counted as 0."""
+"""Log error of triangulated depth: regularises the slope towards 0 in scenes of uniform depth."""
 _USUAL_WANDER_LOG = 0.15
 _USUAL_COUNTS = 4
-"""Prior for few keyframes: the median over the calibration's runs, weighted as this many keyframes."""
+"""Prior variation for few keyframes: the calibration's median, weighted as this many keyframes."""
 _KEPT = 200
-"""Newest ratios kept: as many as the map has keyframes at most."""
+"""Maximum number of ratios stored, at least the map's number of keyframes."""
 _LEAST_ANCHORS = 8
 _LEAST_SPREAD_LOG = 0.02
 """Minimum number of anchors of a ratio, whose median then has a third of their spread as its sigma; and lower bound of
-that spread, less than any depth network has."""
+that spread, below that of any depth network."""
 
 
 @dataclass(frozen=True, slots=True)
 class DepthRatio:
-    """How one keyframe's network depth compares with its anchors."""
+    """Ratio of network depth to map depth over one keyframe's anchors."""
 
     log_ratio: float
     """Median of log (network depth [m] / map depth [map units])."""
@@ -53,12 +53,12 @@ class DepthRatio:
     slope: float = 1.0
     """Of log network depth on log map depth."""
     depth_spread_log: float = 0.3
-    """Standard deviation of the anchors' log depth: without any, the slope is noise."""
+    """Standard deviation of the anchors' log depth: near zero the slope is noise."""
     points: int = 100
 
     @property
     def usable(self) -> bool:
-        """Whether all of it are numbers."""
+        """Whether all values are finite and the spread is positive."""
         numbers = (self.log_ratio, self.spread_log, self.slope, self.depth_spread_log)
         return all(map(math.isfinite, numbers)) and self.spread_log > 0 and self.points > 0
 
@@ -83,7 +83,7 @@ def compared(network_m: FloatArray, map_depth: FloatArray) -> DepthRatio | None:
 
 
 def _slope(x: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Huber's slope of ``y`` on ``x``, both ``(A,)``, and the standard deviation of the ``x`` that it rests on."""
+    """Huber regression slope of ``y`` on ``x``, both ``(A,)``, and the weighted standard deviation of ``x``."""
     weight, slope, power = np.ones(len(x)), 0.0, 0.0
     for _ in range(10):
         share = weight / weight.sum()
@@ -109,12 +109,12 @@ class DepthScale:
 
     @property
     def in_domain(self) -> bool:
-        """Whether the network is accurate enough for such scenes to provide metres."""
+        """Whether the network is accurate enough in such scenes to determine the scale."""
         return self.sigma <= MOST_SIGMA
 
     @property
     def opinion(self) -> LogScale:
-        """For fusion with other sources."""
+        """The estimate in the log domain, for fusion with other sources."""
         return LogScale(self.log_scale, self.sigma, "depth")
 
     def statistics(self) -> dict[str, float]:
@@ -129,7 +129,7 @@ class DepthScale:
         }
 
     def warning(self) -> str | None:
-        """What the user should know; None when there is nothing to say."""
+        """Warning for the user; None inside the domain."""
         if self.in_domain:
             return None
         return (
@@ -145,7 +145,7 @@ class DepthRatios:
     """The ratios of a map's keyframes.
 
     Args:
-        least_sigma: Log error of the scale that a network may have without any sign of it.
+        least_sigma: Log error of the scale that the statistics of the keyframes do not reveal.
     """
 
     def __init__(self, least_sigma: float) -> None:
@@ -154,7 +154,7 @@ class DepthRatios:
         self._scale: DepthScale | None = None
 
     def add(self, ratio: DepthRatio) -> None:
-        """One keyframe's ratio; one that is not finite is ignored."""
+        """Add one keyframe's ratio; non-finite ones are ignored."""
         if ratio.usable:
             self._ratios.append(ratio)
             del self._ratios[:-_KEPT]
@@ -180,7 +180,7 @@ class DepthRatios:
 
 
 def _robust_mean(x: FloatArray, sigma: FloatArray) -> tuple[float, float]:
-    """Huber's mean of ``(N,)`` and its standard deviation, were their errors independent."""
+    """Huber mean of ``(N,)`` and its standard deviation for independent errors."""
     centre = float(np.median(x))
     spread = np.hypot(sigma, _robust_deviation(x) + 1e-6)
     for _ in range(5):

@@ -7,11 +7,10 @@ world. Both kinds of measurement are linear in them, so each gives information o
     d_i = s\,u_i + s\,\delta \times u_i + b_i L_i + \epsilon_i, \qquad
     h_j = s\,z_j + (s\,\delta \times p_j)_z + c_k + w_j + \epsilon_j
 
-with velocity bias :math:`b` and drift of the visual position :math:`w` that decorrelate in seconds
-(Ornstein-Uhlenbeck; between the ends of an interval only the drift's change counts, so that long ways weigh more than
-swings on the spot). How large they are is chosen by the restricted likelihood of the residuals (Patterson and Thompson
-1971): a map that a tilt of half a degree or a slow drift bends must not be taken for noise that averages out, nor the
-other way round.
+with velocity bias :math:`b` and drift of the visual position :math:`w` that decorrelate in seconds (Ornstein-Uhlenbeck;
+only the drift's change over an interval counts, so that long paths weigh more than oscillations in place). Their
+magnitudes maximise the restricted likelihood of the residuals (Patterson and Thompson 1971): distortion of the map by
+tilt or slow drift must not be modelled as white noise, which averages out, nor vice versa.
 """
 
 import math
@@ -26,35 +25,35 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 _LEAST_WEIGHT = 1e-3
 _LEAST_WAY = 0.5
-"""Share of the way by the images that a fit must explain for its scale to be the map's."""
+"""Minimum share of the visual path explained by the fit."""
 MIN_DISPLACEMENTS = 6
 _MIN_HEIGHTS = 4
 _MOST_PARTS = 4
-"""Parts of a flight whose scales are compared: of a tenth of it there is too little to tell."""
+"""Maximum number of parts of a flight whose scales are compared; shorter parts are too noisy."""
 _BELIEF = 20.0
 """Weight of the expected noise against the observed one, in residuals."""
 _USUAL_BIAS_M_S = 0.01
 _USUAL = (_USUAL_BIAS_M_S, 0.03)
-"""Standard deviations of the velocity bias [m/s] and of the visual drift [m] before any are told apart."""
+"""Prior standard deviations of the velocity bias [m/s] and of the visual drift [m]."""
 _BIAS_AND_DRIFT = ((0.003, 0.002), (0.01, 0.002), (0.03, 0.002), (0.003, 0.03), _USUAL, (0.03, 0.03), (0.1, 0.03))
-"""Those that are tried."""
+"""Candidates."""
 _BIAS_MEMORY_S = 12.0
 _DRIFT_M = (0.002, 0.006, 0.02, 0.06)
 _DRIFT_MEMORY_S = 4.0
 USUAL_WANDER, MOST_WANDER = 0.03, 0.81
 _WANDER = (USUAL_WANDER, 0.09, 0.27, MOST_WANDER)
-"""Standard deviations of how much a map's log scale changes while its age grows by a factor of e: in the first seconds
-by 2 to 14 %, later by 1 to 2 %; along bare walls the scale triples. No less than usual: a flight's velocities cannot
-tell 1 from 3 %."""
+"""Candidate standard deviations of the change of the log scale per e-fold of the map's age: 2 to 14 % in the first
+seconds, later 1 to 2 %; with few features the scale may triple. The default is the minimum: velocities of one flight do
+not distinguish 1 from 3 %."""
 _VIEW_RAD = math.radians(60.0)
-"""Width of a usual camera's view."""
+"""Typical field of view."""
 _YOUNG_S = 1.0
-"""Age before which a map is no younger."""
+"""Lower bound of the map's age."""
 _BIN_S = 0.5
 _SCALE, _THETA, _OFFSETS = 0, slice(0, 4), slice(4, None)
-"""Places in the vector of unknowns; heights have an offset for each stretch behind theta."""
+"""Slices of the vector of unknowns; heights append an offset per segment to theta."""
 _WHEN_TOLD_APART = 2
-"""Iteration in which the noise is chosen: the weights have seen the worst outliers by then."""
+"""Iteration in which the noise model is selected: by then the worst outliers are downweighted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,20 +65,20 @@ class Evidence:
     vector: FloatArray
     """``(4,)`` information times mean."""
     rms_m: float
-    """Residual."""
+    """RMS residual."""
     bias: FloatArray
     """``(3,)`` velocity bias at the end [m/s]; zeros for heights."""
     log_likelihood: float = 0.0
-    """Of the displacements, up to a constant: larger where the same ones are better explained."""
+    """Of the displacements, up to a constant, for comparing models of the same data."""
     wander: float = USUAL_WANDER
-    """How much the map's scale changes; displacements tell, heights do not."""
+    """Standard deviation of the map's scale change; estimated by displacements only."""
     drift_sigma: float = 0.0
-    """Relative error of the present scale because of that; velocities and heights share it."""
+    """Relative error of the present scale due to that change, common to velocities and heights."""
     torn: bool = False
-    """Whether no scale fits the greater part of the way that the images saw: the map has none."""
+    """Whether no single scale fits most of the visual path."""
 
     def softened(self, sigma: float) -> "Evidence":
-        """The same with an error of the scale [m per map unit] that no averaging removes."""
+        """The same with a systematic error of the scale [m per map unit]."""
         q = sigma**2
         column = self.information[:, _SCALE] * (q / (1.0 + q * float(self.information[_SCALE, _SCALE])))
         information = self.information - np.outer(column, self.information[_SCALE])
@@ -87,7 +86,7 @@ class Evidence:
 
 
 def solved(evidence: list[Evidence], tilt_sigma_rad: float | FloatArray) -> tuple[float, float] | None:
-    """Scale and relative standard deviation from all evidence, the rotation free within its prior."""
+    """Scale and relative standard deviation from all evidence, with the rotation marginalised under its prior."""
     information = np.sum([e.information for e in evidence], axis=0)
     vector = np.sum([e.vector for e in evidence], axis=0)
     if not information[_SCALE, _SCALE] > 0:
@@ -106,7 +105,7 @@ def solved(evidence: list[Evidence], tilt_sigma_rad: float | FloatArray) -> tupl
 
 
 def _tilt_prior(s: float, tilt_sigma_rad: float | FloatArray, offsets: int = 0) -> FloatArray:
-    """Information on the unknowns before any measurement: the scale is free, offsets nearly."""
+    """Prior information on the unknowns: none on the scale, weak on offsets."""
     return np.diag([0.0, *np.broadcast_to((s * tilt_sigma_rad) ** -2, 3), *[1e-6] * offsets])
 
 
@@ -120,10 +119,10 @@ def displacement_evidence(
     tilt_sigma_rad: float | FloatArray,
     aged: FloatArray | None = None,
 ) -> Evidence | None:
-    """From visual and telemetry displacements of the same intervals.
+    """Evidence from visual and telemetry displacements of the same intervals.
 
-    Noise of the visual ones is allowed for by taking the likeliest true displacement as the regressor's partner (York
-    1968): plain least squares would shrink the scale by the share of noise.
+    Errors-in-variables regression: the regressor's partner is the most likely true displacement (York 1968). Ordinary
+    least squares would shrink the scale by the share of noise.
 
     Args:
         moved_map: Visual displacements in world axes [map units], shape ``(N, 3)``.
@@ -133,8 +132,8 @@ def displacement_evidence(
         sigma_map: Standard deviation of ``moved_map`` per axis, shape ``(N,)``.
         sigma_m: Expected standard deviation of ``moved_m`` per axis, shape ``(N,)``.
         tilt_sigma_rad: Prior on the rotation; ``(3,)``, about each axis, or one for all.
-        aged: How much the map has aged since each interval, see `aged_since`, ``(N,)``: the scale found is the present
-            one, to which older intervals tell less. None: one scale holds throughout.
+        aged: Log age of the map since each interval, see `aged_since`, ``(N,)``: estimates the present scale, with less
+            weight on older intervals. None: a constant scale.
     """
     n = len(moved_map)
     length = float(np.sum(moved_map**2))
@@ -195,19 +194,19 @@ def height_evidence(
     aged: FloatArray | None = None,
     wander: float = USUAL_WANDER,
 ) -> Evidence | None:
-    """From height above the floor against visual height, with a free offset in each stretch without a floor step.
+    """Evidence from height above the floor against visual height, with a free offset per segment without floor step.
 
     Args:
         p_map: Visual positions of the body, world axes (z up) [map units], shape ``(N, 3)``.
         z_m: Measured height [m], shape ``(N,)``.
         stamp_s: Times ``(N,)``.
-        segment: Number of the stretch, from `floor_segments`, shape ``(N,)``.
+        segment: Segment number from `floor_segments`, shape ``(N,)``.
         sigma_map: Noise of ``p_map`` per axis.
         sigma_m: Expected noise of ``z_m``.
         scale: Rough metres per map unit.
         tilt_sigma_rad: Prior on the rotation; ``(3,)``, about each axis, or one for all.
         aged: As in `displacement_evidence`, ``(N,)``.
-        wander: How much the map's scale changes, by the displacements.
+        wander: Standard deviation of the map's scale change, from the displacements.
     """
     if len(z_m) < 2 * _MIN_HEIGHTS:
         return None
@@ -232,9 +231,7 @@ def height_evidence(
     memory = np.exp(-np.abs(t[:, None] - t[None]) / _DRIFT_MEMORY_S) * together
     wandering = np.zeros((n, n))
     if aged is not None:
-        risen = (
-            np.tril(together) * np.diff(p[:, 2], prepend=p[0, 2])[None]
-        )  # sums of these are heights, but for offsets
+        risen = np.tril(together) * np.diff(p[:, 2], prepend=p[0, 2])[None]  # sums of these are heights up to offsets
         wandering = (wander * scale) ** 2 * (risen @ _common(np.interp(t, stamp_s, aged)) @ risen.T)
     prior = _tilt_prior(scale, tilt_sigma_rad, K)
     weight: FloatArray = np.ones(n)
@@ -256,7 +253,7 @@ def height_evidence(
     if fit is None:
         return None
     A, v = fit.information.copy(), fit.vector
-    A[_SCALE, _SCALE] -= fit.inverse_trace * sigma_map**2 / float(np.mean(count))  # noise of the regressor is no motion
+    A[_SCALE, _SCALE] -= fit.inverse_trace * sigma_map**2 / float(np.mean(count))  # bias from noise in the regressor
     if not A[_SCALE, _SCALE] > 0:
         return None
     inner = np.linalg.inv(A[_OFFSETS, _OFFSETS] + 1e-9 * np.eye(K))  # the offsets are marginalised
@@ -267,11 +264,11 @@ def height_evidence(
 
 
 def _unrest(white: FloatArray, fit: "_Fit", J: FloatArray, latent: FloatArray, target: FloatArray) -> float:
-    """Error of the mean scale [m per map unit] because parts of the flight have scales that differ beyond their noise.
+    """Error of the mean scale [m per map unit] due to differences between parts of the flight beyond their noise.
 
-    A map that drifts in scale, or telemetry that is right in part: no averaging within a part tells of it. What the fit
-    has left out counts here as well: it is a part of the map whose scale is another. The variance between parts is that
-    of a random-effects model (DerSimonian and Laird 1986).
+    Scale drift of the map, or telemetry that is right only in part, does not show in the residuals within a part.
+    Outliers of the fit are included: they may be a part of the map with another scale. The variance between parts is
+    that of a random-effects model (DerSimonian and Laird 1986).
     """
     n = len(white)
     parts = min(_MOST_PARTS, n // MIN_DISPLACEMENTS)
@@ -297,19 +294,19 @@ def _unrest(white: FloatArray, fit: "_Fit", J: FloatArray, latent: FloatArray, t
 
 
 def aged_since(stamps_s: FloatArray, began_s: float, now_s: float) -> FloatArray:
-    """Logarithm of the map's age now over its age at each stamp ``(N,)``; a map drifts most while it is young."""
+    """Log of the map's age now over its age at each stamp ``(N,)``; a map drifts most in its first seconds."""
     return np.asarray(np.log((now_s - began_s + _YOUNG_S) / (np.maximum(stamps_s - began_s, 0.0) + _YOUNG_S)))
 
 
 def turned_since(T: FloatArray) -> FloatArray:
-    """Widths of view ``(N,)`` by which a camera at ``T`` ``(N, 4, 4)`` has turned at most from what it sees now."""
+    """Maximum rotation since each pose ``T`` ``(N, 4, 4)`` relative to the last one, in fields of view ``(N,)``."""
     cosine = 0.5 * (np.einsum("nij,ij->n", T[:, :3, :3], T[-1, :3, :3]) - 1.0)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     return np.asarray(np.maximum.accumulate(angle[::-1])[::-1] / _VIEW_RAD)
 
 
 def _common(aged: FloatArray) -> FloatArray:
-    """What two moments' scales have in common of the change since, ``(N, N)``: a random walk back from the present."""
+    """Covariance ``(N, N)`` of the scale changes since two moments: a random walk back from the present."""
     return np.minimum(aged[:, None], aged[None])
 
 
@@ -325,7 +322,7 @@ def _of_changes(apart_s: FloatArray, duration_s: FloatArray, memory_s: float) ->
 
 @dataclass(frozen=True, slots=True)
 class _Slow:
-    """Correlated noise: covariance ``(N, N)``, the part due to velocity bias, log prior, wandering of the scale."""
+    """Correlated noise: covariance ``(N, N)``, the part due to velocity bias, log prior, variation of the scale."""
 
     covariance: FloatArray
     bias: FloatArray
@@ -345,16 +342,16 @@ class _Fit:
     vector: FloatArray
     residual: FloatArray
     slow: FloatArray
-    """``(axes, N)``, the part of the residual that is bias or drift."""
+    """``(axes, N)``, the part of the residual due to bias or drift."""
     bias: FloatArray
-    """``(axes, N)``, the part that is bias."""
+    """``(axes, N)``, the part due to bias."""
     noise: _Slow
     inverse_trace: float
     kappa: float
-    """Variance of the residuals over what was expected."""
+    """Variance of the residuals over the expected one."""
     log_likelihood: float
     wander: float = USUAL_WANDER
-    """Root mean square over the noises tried, by their probability."""
+    """Posterior RMS over the candidates."""
 
 
 def _best(
@@ -401,7 +398,7 @@ def _best(
 
 
 def _expected(told: list[tuple[float, float]]) -> float:
-    """Root mean square of wanders, by the log likelihood before each."""
+    """Posterior RMS of the scale variation, from (log-likelihood, variation) pairs."""
     likely, wander = np.array(told).T
     share = np.exp(likely - likely.max())
     return math.sqrt(float(np.sum(share * wander**2) / np.sum(share)))

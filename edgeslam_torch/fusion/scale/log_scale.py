@@ -1,6 +1,6 @@
 r"""Metric scale of a monocular map with its uncertainty, from displacements, height and predicted depth.
 
-The essential matrix leaves translation without length and the paper never says how metres enter. Here each source
+The essential matrix gives translation up to scale, and the paper does not say how metric scale enters. Here each source
 gives :math:`\log s` (metres per map unit) with a standard deviation, and the three are fused in the log domain.
 """
 
@@ -23,9 +23,9 @@ class LogScale:
 
 
 def floor_segments(stamp_s: FloatArray, z_m: FloatArray, z_predicted_m: FloatArray, step_m: float) -> IntArray:
-    """Number the stretches between floor steps (furniture passing below), shape ``(N,)``.
+    """Number the segments between floor steps (furniture passing below), shape ``(N,)``.
 
-    A step is a change between neighbours that differs from the predicted change by more than ``step_m``, or a hole of
+    A step is a change between neighbours that differs from the predicted change by more than ``step_m``, or a gap of
     more than half a second.
     """
     if len(z_m) == 0:

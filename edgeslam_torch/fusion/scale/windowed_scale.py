@@ -1,8 +1,8 @@
-"""The scale of the last seconds alone: does the map still have the scale that the whole flight says?
+"""Scale of the last seconds alone, to detect a scale change within the map.
 
-Fits over a flight take what contradicts them for outliers. Where a map's scale collapses, as along a corridor after a
-take-off without parallax, all that is new contradicts all that is old, and the flight's fit stays sure of what is no
-longer so. The last way flown, told by telemetry, over the way that the images saw needs no fit.
+A fit over the whole flight rejects recent contradictory data as outliers. If a map's scale collapses, as after a
+take-off without parallax, all new data contradict all old data, and the fit stays confident. The ratio of the recent
+telemetry displacement to the visual one needs no fit.
 """
 
 import math
@@ -15,24 +15,24 @@ from edgeslam_torch.fusion.scale.log_scale import LogScale
 from edgeslam_torch.types import FloatArray
 
 PRESENT_S = 4.0
-"""Time that counts as present: two metres at 0.5 m/s."""
+"""Length of the window: two metres at 0.5 m/s."""
 _LEAST_COUNT, _LEAST_WAY_M = 3, 0.8
 _SAME_WAY = 0.9
-"""Cosine of the angle between both ways: 26 degrees."""
+"""Minimum cosine of the angle between both displacements: 26 degrees."""
 _LEAST_SIGMA = 0.05
 _OF_STEP = 0.4
-"""Standard deviation of a velocity that is rounded or truncated, one does not know which, in steps."""
+"""Standard deviation of a velocity that is rounded or truncated with equal probability [steps]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parted:
-    """A present scale that the flight so far leaves no room for."""
+    """A present scale that contradicts the flight's."""
 
     now: LogScale
     before: LogScale
 
     def warning(self) -> str:
-        """What happened, for health and summary."""
+        """Warning for health and summary."""
         now, before = math.exp(self.now.log_scale), math.exp(self.before.log_scale)
         return (
             f"the map has changed its scale: {now:.3g} metres per unit by the velocities of the last "
@@ -43,13 +43,13 @@ class Parted:
 def present_scale(
     moved_map: FloatArray, moved_m: FloatArray, duration_s: FloatArray, step_m_s: float
 ) -> LogScale | None:
-    """Metres per map unit of the way ``(N, 3)`` flown in the last seconds; None if it is short, or in two directions.
+    """Metres per map unit of the displacements ``(N, 3)`` of the last seconds; None if too short or inconsistent.
 
     Args:
-        moved_map: What the images saw, in world axes [map units].
-        moved_m: What telemetry told of the same intervals [m].
+        moved_map: Visual, in world axes [map units].
+        moved_m: By telemetry, over the same intervals [m].
         duration_s: Their lengths ``(N,)``.
-        step_m_s: Of the velocities that telemetry tells.
+        step_m_s: Quantisation step of the velocities.
     """
     if len(moved_map) < _LEAST_COUNT:
         return None
@@ -68,6 +68,6 @@ def present_scale(
 
 
 def has_changed(now: LogScale, moved_map: FloatArray, moved_m: FloatArray) -> bool:
-    """Whether the ways before ``(N, 3)``, told and seen, had another scale: a wrong unit is wrong all the time."""
+    """Whether the displacements before ``(N, 3)`` had another scale: a wrong unit would be wrong all the time."""
     told, seen = (float(np.linalg.norm(way, axis=1).sum()) for way in (moved_m, moved_map))
     return told > 0 and seen > 0 and abs(now.log_scale - math.log(told / seen)) > AT_ODDS_LOG
