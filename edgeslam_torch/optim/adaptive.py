@@ -15,7 +15,7 @@ from edgeslam_torch.optim.window import Window
 from edgeslam_torch.types import FloatArray
 
 SMALLEST_SIGMA = 1e-9
-"""Below this a term's residuals are rounding errors, and its weight would be meaningless."""
+"""Minimum standard deviation of a term; smaller residuals are rounding errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class TermScale:
     low: float
     """Lower bound, so that no term dominates after a window with unusually small residuals."""
     high: float
-    """Upper bound: a bad window must not silence a term."""
+    """Upper bound, so that a bad window does not disable a term."""
     smoothing: float = 0.8
     """Weight of the old value (in its logarithm) at each update."""
     min_count: int = 30
@@ -106,12 +106,12 @@ def window_losses(problem: WindowProblem) -> dict[str, float]:
     """Mean squared residual of every active term, and their weighted sum, paper eqs. (15)-(28).
 
     Args:
-        problem: A window; terms that it leaves out are left out.
+        problem: A window; omitted terms stay omitted.
 
     Returns:
         ``reprojection_px2``, ``alignment_px2``, ``cycle`` (relative depth squared) or ``cycle_px2``, ``angle``
-        (cosine squared), and ``total``: the sum with every term divided by its robust variance, so that 1 is what
-        normally distributed residuals contribute. Empty for a window without terms.
+        (cosine squared), and ``total``: the sum with every term divided by its robust variance, so that normally
+        distributed residuals contribute 1 per term. Empty for a window without terms.
     """
     junctions = problem.junctions if problem.junctions is None else replace(problem.junctions, cosines=True)
     found = term_residuals(replace(problem, inv_sigma=np.ones(len(problem.uv)), junctions=junctions))
@@ -140,9 +140,9 @@ def with_scales(problem: WindowProblem, scales: AdaptiveScales, alike: float = 1
 
     Args:
         problem: A window.
-        scales: As `AdaptiveScales.updated` makes them of `term_residuals`.
-        alike: Factor on the sigmas of edge terms: neighbours on one edge have correlated errors, so ``alike**2`` of
-            them count as one.
+        scales: From `AdaptiveScales.updated` with `term_residuals`.
+        alike: Factor on the sigmas of edge terms: errors of neighbouring pixels on an edge are correlated, so
+            ``alike**2`` of them count as one.
     """
     sigma = {name: term.sigma for name, term in scales.terms.items()}
     problem = replace(problem, inv_sigma=problem.inv_sigma / sigma["reproj"])

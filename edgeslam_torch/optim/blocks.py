@@ -1,7 +1,7 @@
-"""What poses see, laid out for the solver: anchors, and edge pixels and junctions that a host pose owns.
+"""Landmark blocks in the solver's memory layout: anchors, and edge pixels and junctions owned by a host pose.
 
 Each kind turns a state into `Normal` equations. Derivatives of hosted blocks are by the relative pose of host and
-target; the adjoint carries them to the two poses: ``xi_relative = xi_target - Ad(T_target_host) xi_host``.
+target; the adjoint transforms them to the two poses: ``xi_relative = xi_target - Ad(T_target_host) xi_host``.
 """
 
 from dataclasses import dataclass
@@ -21,14 +21,14 @@ Value = TypeVar("Value", bound=np.generic)
 INVERSE_DEPTH_MIN = 1e-4
 """Lower bound of refined inverse depths: practically at infinity, never behind the camera [1/map unit]."""
 LEAST_SHRINKAGE = 0.1
-"""Lower bound of an anchor's inverse distance after a step, of that before."""
+"""Lower bound of an anchor's inverse distance after a step, relative to that before."""
 _TINY = 1e-12
 _NO_PRIORS = DepthPriors(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True)
 class Normal:
-    """Normal equations of the blocks of one kind at a state, and the residuals that they are made of."""
+    """Normal equations of the blocks of one kind at a state, and their residuals."""
 
     V: FloatArray
     """``(B, m, m)``."""
@@ -38,26 +38,26 @@ class Normal:
     """``(S, m, 6)`` couplings with poses, see `Links`."""
     cost: float
     r: FloatArray
-    """Whitened residuals in the caller's order ``(n, k)``; depth priors not among them."""
+    """Whitened residuals in the caller's order ``(n, k)``, without depth priors."""
     front: NDArray[np.bool_]
     """``(n,)`` which lie in front of the camera."""
 
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """Which free poses see which blocks."""
+    """Couplings between free poses and blocks, sorted by block."""
 
     start: IntArray
     """``(B + 1,)`` first row of each block."""
     column: IntArray
-    """``(S,)`` free pose of each row, rising within a block."""
+    """``(S,)`` free pose of each row, ascending within a block."""
 
 
 class Blocks(Protocol):
     """Blocks of one kind."""
 
     x: FloatArray
-    """``(B, m)`` at the start."""
+    """``(B, m)`` initial values."""
     links: Links
 
     def normal(self, T_c_w: FloatArray, x: FloatArray, H: FloatArray, g: FloatArray) -> Normal:
@@ -68,7 +68,7 @@ class Blocks(Protocol):
 
 
 class Anchors:
-    """Points in the world: reprojections, and what is known of their depths."""
+    """Points in the world: reprojections and depth priors."""
 
     def __init__(self, problem: WindowProblem, column: IntArray, config: LmConfig, rows: Rows) -> None:
         """Lay out; ``column (W,)`` is the free-pose number of each pose, -1 for a fixed one."""
@@ -132,7 +132,7 @@ class _Seen:
 
 
 class Hosted:
-    """Blocks of inverse depths in a host pose, each row of which is robust by itself; edges and junctions."""
+    """Blocks of inverse depths in a host pose, with one robust weight per row: edges and junctions."""
 
     def __init__(
         self,
@@ -265,7 +265,7 @@ class Junctions(Hosted):
 
 
 def linked(block: IntArray, column: IntArray, blocks: int, free: int) -> tuple[Links, IntArray]:
-    """Rows of couplings, one for each block and free pose that sees it, however often.
+    """Rows of couplings: one for each pair of a block and a free pose that sees it.
 
     Args:
         block: ``(n,)`` blocks.
@@ -274,7 +274,7 @@ def linked(block: IntArray, column: IntArray, blocks: int, free: int) -> tuple[L
         free: Number of free poses.
 
     Returns:
-        The rows, and which of them each of the ``n`` uses, -1 with a fixed pose.
+        The rows, and the row of each of the ``n`` entries, -1 for a fixed pose.
     """
     moves = column >= 0
     key, row = np.unique(block[moves] * max(free, 1) + column[moves], return_inverse=True)
@@ -291,7 +291,7 @@ def add_blocks(H: FloatArray, row: IntArray, column: IntArray, blocks: FloatArra
 
 
 def kernel_number(kernel: Kernel) -> int:
-    """As `optim.kernels.normal_equations` counts them."""
+    """Number of a robust kernel in `optim.kernels.normal_equations`."""
     return list(Kernel).index(kernel)
 
 

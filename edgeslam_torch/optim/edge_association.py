@@ -77,8 +77,8 @@ def associate_edges(
 ) -> EdgePairs:
     """Partners of edge pixels in their target poses.
 
-    A pair is kept when the projected pixel lies in the image, an edge runs there in the same direction with the
-    same side bright, it is near across and along, and its depth, where known, agrees.
+    A pair is kept if the projected pixel lies in the image, the partner is near, has the same direction and polarity
+    (bright side), and its depth, where known, agrees.
 
     Args:
         fields: One per pose; None for a pose that is no target.
@@ -90,9 +90,9 @@ def associate_edges(
         pair_edge: ``(P,)`` candidate pairs: edge.
         pair_pose: ``(P,)`` candidate pairs: target pose.
         K: fx, fy, cx, cy [px].
-        max_px: Largest distance to the partner.
-        max_turn_rad: Largest angle between the predicted and the seen normal.
-        max_depth_ratio: Largest ratio between the predicted and the seen depth.
+        max_px: Maximum distance to the partner.
+        max_turn_rad: Maximum angle between the predicted and the observed normal.
+        max_depth_ratio: Maximum ratio between the predicted and the observed depth.
     """
     f, c = np.array(K[:2]), np.array(K[2:])
     parts = []

@@ -1,4 +1,4 @@
-"""The Levenberg-Marquardt loop: damping, acceptance, and a stated reason for stopping."""
+"""The Levenberg-Marquardt loop: damping, acceptance of steps, and the reason for stopping."""
 
 import math
 from dataclasses import dataclass
@@ -66,7 +66,7 @@ class LmSummary:
 
 
 def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[L, LmSummary]:
-    """Minimise a robust sum of squares; returns the last state's normal equations and how it went.
+    """Minimise a robust sum of squares; returns the last state's normal equations and a summary.
 
     The damping follows Nielsen (1999): it shrinks with the agreement of predicted and actual decrease, and grows by a
     doubling factor with every rejected step. Only states of lower, finite cost are accepted.
@@ -106,7 +106,7 @@ def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[L
                     return ended(StopReason.GRADIENT_CONVERGED)
                 continue
             if abs(decrease) <= 1e-12 * system.cost and math.isfinite(trial.cost):
-                return ended(StopReason.COST_CONVERGED)  # the minimum, to the last digits
+                return ended(StopReason.COST_CONVERGED)  # the minimum, up to rounding
         mu *= nu
         nu *= 2.0
         if mu > config.mu_max:

@@ -14,14 +14,13 @@ def refine_window(problem: WindowProblem, config: LmConfig | None = None) -> Win
 
     Args:
         problem: Poses, anchors, observations and priors.
-        config: How to minimise.
+        config: Solver settings.
 
     Returns:
-        The refined window. Whatever the input, poses and points are finite if they were finite on entry, and ``stop``
-        is the reason for stopping.
+        The refined window with the reason for stopping. Poses and points are finite if they were finite on entry.
 
     Raises:
-        ValueError: If array lengths disagree or an index points outside.
+        ValueError: If array lengths disagree or an index is out of range.
     """
     config = config or LmConfig()
     _check(problem)

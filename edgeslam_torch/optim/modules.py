@@ -1,7 +1,7 @@
 """Residuals of a window by the modules of `losses`, their derivatives by automatic differentiation.
 
-The definition of what `optim.kernels` computes: short, differentiable, on a GPU if there is one, and many times slower.
-``window.solver = "modules"`` refines with it; functions take and return what `optim.kernels.rows` have.
+The reference of `optim.kernels`: short, differentiable, on a GPU if there is one, and many times slower. Selected by
+``window.solver = "modules"``; the functions have the signatures of `optim.kernels.rows`.
 """
 
 from collections.abc import Callable
@@ -49,7 +49,7 @@ def reprojection(
 def inverse_depth(
     T_c_w: FloatArray, p_w: FloatArray, pose: IntArray, anchor: IntArray, prior: FloatArray, inv_sigma: FloatArray
 ) -> Rows:
-    """Inverse z-depths of anchors in their hosts, minus what is expected of them."""
+    """Inverse z-depths of anchors in their hosts, predicted minus expected."""
     T, p = _tensor(T_c_w[pose]), _tensor(p_w[anchor])
 
     def residuals(xi: Tensor, dp: Tensor) -> Residuals:
@@ -75,7 +75,7 @@ def edges(
     cycle_inv_sigma: float,
     K: Intrinsics,
 ) -> Rows:
-    """Pairs of an edge pixel and its partner: alignment, and the cycle if it has a form."""
+    """Pairs of an edge pixel and its partner: alignment, and the cycle if enabled."""
     T, at, d, camera = _tensor(T_j_i[view]), _tensor(uv[edge])[:, None], _tensor(inverse_depth[edge]), _matrix(K)
     partner, held = (_tensor(uv_j)[:, None], _tensor(normal_j)[:, None]), _tensor(inverse_depth_j)[:, None]
     depth_j = torch.where(held > 0, 1.0 / torch.where(held > 0, held, 1.0), 0.0)
@@ -107,7 +107,7 @@ def junctions(
     cosines: bool,
     K: Intrinsics,
 ) -> Rows:
-    """Pairs of an L-junction and the one seen in the target: corner, and arms or the angle between them."""
+    """Pairs of an L-junction and its partner in the target: corner, and arms or the angle between them."""
     T, camera = _tensor(T_j_i[view]), _tensor(np.array(K))
     rays = ((_tensor(uv[junction]) - camera[2:]) / camera[:2]).permute(2, 1, 0)
     d, seen = _tensor(inverse_depth[junction]).mT, (_tensor(uv_j).mT, _tensor(arms_j).permute(2, 1, 0))
@@ -124,7 +124,7 @@ def junctions(
 def _rows(residuals: Callable[[Tensor, Tensor], Residuals], m: int) -> Rows:
     """Residuals ``(n, k)``, derivatives ``(n, k, 6 + m)`` and validity ``(n,)``.
 
-    Each residual depends on one pose and one block: moving all of them alike yields each one's own derivatives.
+    Each residual depends on one pose and one block: one perturbation common to all yields every derivative.
     """
 
     def at(step: Tensor) -> tuple[Tensor, Residuals]:

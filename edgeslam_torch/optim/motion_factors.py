@@ -1,9 +1,9 @@
-r"""Residuals of camera positions, gravity and headings: what inertial or other measurements of motion add to a window.
+r"""Residuals of camera positions, gravity and headings: inertial and other motion measurements of a window.
 
 Positions come as one Gaussian, :math:`\chi^2 = c^T A c - 2 b^T c + k` of the stacked camera centres
 :math:`c_i = -R_i^T t_i`, whose derivative by a left perturbation :math:`(\rho, \phi)` of the pose is
 :math:`-R_i^T \rho`: the translation alone. Gravity is a direction in the camera, :math:`R_i g - u_i`, with the
-derivative :math:`-[R_i g]_\times \phi`. A heading is the turn about the vertical from a measured rotation
+derivative :math:`-[R_i g]_\times \phi`. A heading is the rotation about the vertical from a measured rotation
 :math:`M_i`: of :math:`E_i = M_i^T R_i`, with angle :math:`\theta_i` and axis :math:`a_i`, the part
 :math:`\sin\theta_i\, g^T a_i`, with the derivative
 :math:`\tfrac12 g^T (\mathrm{tr}(E_i) I - E_i)\, M_i^T \phi`.
@@ -31,7 +31,7 @@ class MotionTerms:
         Args:
             centres: Gaussians of camera centres.
             gravity: Up directions.
-            headings: Gaussians of turns about the vertical.
+            headings: Gaussians of rotations about the vertical.
             column: Free-pose number of each pose, -1 for a fixed one.
         """
         self.centres, self.gravity, self.headings = centres, gravity, headings
@@ -92,7 +92,7 @@ def gravity_jacobian(T_c_w: FloatArray, factor: GravityFactor) -> FloatArray:
 
 
 def heading_residual(T_c_w: FloatArray, factor: HeadingFactor) -> FloatArray:
-    """Sine of the turn about the vertical from measured to predicted rotations ``(U,)``."""
+    """Sine of the rotation about the vertical from measured to predicted rotations ``(U,)``."""
     E = np.swapaxes(factor.R_c_w, 1, 2) @ T_c_w[:, :3, :3]
     return np.asarray(0.5 * np.einsum("a,ua->u", factor.up_w, _antisymmetric(E)))
 

@@ -1,6 +1,6 @@
-r"""Pose graph of similarities: spreads over a map what a closed loop says of its drift.
+r"""Pose graph of similarities: distributes the drift measured by a loop closure over the map.
 
-A node is the similarity :math:`S_i` that takes the world to keyframe i, an edge what was measured between two of them.
+A node is the similarity :math:`S_i` that takes the world to keyframe i, an edge a measurement between two of them.
 With the error :math:`E = S_{ij} S_j S_i^{-1}` the residual is :math:`\log E`, in seven numbers (Strasdat, Montiel and
 Davison, RSS 2010). All edges but those that close a loop agree with the map as it is, so the way back of an
 inconsistent loop is shared by its edges in proportion to their uncertainty.
@@ -23,23 +23,23 @@ DAMPING = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class PoseGraph:
-    """Keyframes and what was measured between them."""
+    """Keyframes and the measurements between them."""
 
     S: FloatArray
     """``(N, 4, 4)`` similarities, world to keyframe."""
     fixed: IntArray
-    """Nodes that hold the gauge."""
+    """Nodes that fix the gauge."""
     i: IntArray
     j: IntArray
     """``(E,)`` the nodes of each edge."""
     S_ij: FloatArray
     """``(E, 4, 4)`` measured similarity that takes coordinates of keyframe ``j`` to those of keyframe ``i``."""
     inv_sigma: FloatArray
-    """``(E, 7)`` of translation, rotation and log scale."""
+    """``(E, 7)`` inverse standard deviations of translation, rotation and log scale."""
 
 
 def solve(graph: PoseGraph) -> FloatArray:
-    """The nodes ``(N, 4, 4)`` that agree best with the edges, by Levenberg-Marquardt."""
+    """Nodes ``(N, 4, 4)`` that minimise the weighted squared residuals, by Levenberg-Marquardt."""
     S, damping = graph.S.copy(), DAMPING
     r = residuals(graph, S)
     for _ in range(ITERATIONS):

@@ -37,9 +37,9 @@ class PoseConfig:
     chi2: float = CHI2_2DOF_95
     """Squared whitened residual above which a point is an outlier."""
     step_tolerance: float = 1e-6
-    """Largest tangent component that still counts as movement."""
+    """Largest tangent component below which a round ends."""
     cost_tolerance: float = 1e-4
-    """Relative decrease of the cost that still counts as progress."""
+    """Relative decrease of the cost below which a round ends."""
     min_points: int = 6
     min_depth: float = 1e-3
     condition_max: float = 1e12

@@ -28,7 +28,7 @@ class PriorTerms:
             poses: Pose priors.
             scales: Priors on distances between camera centres.
             column: Free-pose number of each pose, -1 for a fixed one.
-            relative: Priors on one pose seen from another.
+            relative: Priors on relative poses.
         """
         self.poses = [p for p in poses if column[p.pose] >= 0]
         self.relative = [p for p in relative if column[p.pose_i] >= 0 or column[p.pose_j] >= 0]

@@ -43,7 +43,7 @@ class PosePrior:
 
 @dataclass(frozen=True, slots=True)
 class RelativePosePrior:
-    """What is known beforehand of one pose seen from another: ``log(T_j T_i^-1 T_j_i^-1) ~ N(0, information^-1)``."""
+    """Prior on a relative pose: ``log(T_j T_i^-1 T_j_i^-1) ~ N(0, information^-1)``."""
 
     pose_i: int
     pose_j: int
@@ -108,7 +108,7 @@ class EdgeTerms:
     pair_inverse_depth: FloatArray
     """``(P,)`` inverse depth of the target there, held constant; zero if unknown (no cycle)."""
     cycle_px: bool = False
-    """The cycle in pixels, as the paper has it, instead of by relative depth."""
+    """The cycle in pixels, as in the paper, instead of relative depth."""
     cycle_sigma: float = 0.0
     """Standard deviation of the cycle in its own unit; zero switches it off."""
 
@@ -136,9 +136,9 @@ class JunctionTerms:
     pair_pose: IntArray
     """``(Q,)`` target poses, never the host."""
     pair_uv: FloatArray
-    """``(Q, 2)`` corner seen there [px]."""
+    """``(Q, 2)`` corner observed there [px]."""
     pair_arms: FloatArray
-    """``(Q, 2, 2)`` unit directions of the arms seen there."""
+    """``(Q, 2, 2)`` unit directions of the arms observed there."""
     inv_sigma_px: float = 1.0
     """Inverse standard deviation of a corner's position [1/px]; zero switches it off."""
     inv_sigma_angle: float = 20.0
@@ -158,12 +158,12 @@ class CentreFactor:
     vector: FloatArray
     """``(3 K,)`` information times mean."""
     constant: float = 0.0
-    """What makes the cost a chi-square."""
+    """Constant that makes the cost a chi-square."""
 
 
 @dataclass(frozen=True, slots=True)
 class GravityFactor:
-    """The world's up direction as cameras see it."""
+    """The world's up direction measured in cameras."""
 
     pose: IntArray
     """``(U,)`` pose indices."""
@@ -177,7 +177,7 @@ class GravityFactor:
 
 @dataclass(frozen=True, slots=True)
 class HeadingFactor:
-    """A Gaussian of how some cameras are turned about the world's vertical."""
+    """A Gaussian of some cameras' rotations about the world's vertical."""
 
     pose: IntArray
     """``(U,)`` pose indices."""
@@ -196,13 +196,13 @@ class WindowProblem:
     T_c_w: FloatArray
     """``(W, 4, 4)`` world-to-camera poses."""
     pose_fixed: NDArray[np.bool_]
-    """``(W,)`` poses that hold the gauge and do not move."""
+    """``(W,)`` poses that fix the gauge."""
     p_w: FloatArray
     """``(A, 3)`` anchors in the world."""
     obs_pose: IntArray
-    """``(M,)`` which pose saw it."""
+    """``(M,)`` observing pose."""
     obs_anchor: IntArray
-    """``(M,)`` which anchor was seen."""
+    """``(M,)`` observed anchor."""
     uv: FloatArray
     """``(M, 2)`` undistorted pixels."""
     inv_sigma: FloatArray
@@ -228,7 +228,7 @@ class LmConfig:
     """Maximum number of steps, accepted or not."""
     kernel: Kernel = Kernel.HUBER
     delta: float = CHI2_2DOF_95**0.5
-    """Where the kernel departs from least squares [standard deviations]."""
+    """Threshold of the robust kernel [standard deviations]."""
     edge_delta: float = CHI2_1DOF_95**0.5
     """The same for edge and junction rows, which are scalars."""
     mu: float = 1e-4
@@ -239,12 +239,12 @@ class LmConfig:
     step_tolerance: float = 1e-9
     """Largest tangent component below which a step is the last."""
     gradient_tolerance: float = 1e-9
-    """Largest gradient component, in units of its curvature, below which no step is tried."""
+    """Largest gradient component, scaled by its curvature, below which the solver stops."""
     behind_px: float = 1000.0
     """Residual of an observation behind the camera, and upper limit of all residuals."""
     solver: str = "compiled"
-    """What computes residuals and derivatives: the ``compiled`` loops of `optim.kernels`, or the ``modules`` of
-    `losses` and automatic differentiation."""
+    """Implementation of residuals and derivatives: the ``compiled`` loops of `optim.kernels`, or the ``modules`` of
+    `losses` with automatic differentiation."""
     losses: bool = False
     """Report the losses of the result."""
     diagnostics: bool = True
@@ -283,7 +283,7 @@ class WindowResult:
     edge_inverse_depth: FloatArray = field(default_factory=lambda: np.zeros(0))
     """``(E,)`` refined inverse depths of the edges."""
     edge_sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """``(E,)`` their standard deviations with the poses held; infinite if unobserved."""
+    """``(E,)`` their standard deviations with fixed poses; infinite if unobserved."""
     edge_chi2: FloatArray = field(default_factory=lambda: np.zeros(0))
     """``(P,)`` squared whitened alignment residuals; infinite behind the camera."""
     junction_inverse_depth: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
@@ -291,7 +291,7 @@ class WindowResult:
     rank_deficiency: int = 0
     """Unobservable directions of the free poses (1 for a free scale), -1 when not computed."""
     losses: dict[str, float] = field(default_factory=dict)
-    """The losses of the result by name, as `window_losses` states them; empty unless asked for."""
+    """The losses of the result by name, see `window_losses`; empty unless `LmConfig.losses` is set."""
     pose_covariance: FloatArray = field(default_factory=lambda: np.full((6, 6), np.nan))
     """``(6, 6)`` of the last free pose, left tangent, anchors marginalised; NaN when not computed."""
 

@@ -1,4 +1,4 @@
-"""The unit of a refined window: nothing in it tells one, and what it is held by may have been wrong."""
+"""Scale of a refined window, which images do not determine: chosen after refinement."""
 
 from dataclasses import replace
 
@@ -10,14 +10,14 @@ from edgeslam_torch.optim.problem import WindowProblem, WindowResult
 MIN_EXTENT = 1e-6
 """Minimum distance between keyframes that defines a scale [map units]."""
 _NEWEST, _LEAST_WAY = 10, 4
-"""Keyframes that may still have drifted, a window of them, and older ones below which nothing else tells the unit."""
+"""Number of newest keyframes, which may have drifted (a window), and minimum number of older ones to fix the scale."""
 
 
 def with_same_depths(problem: WindowProblem, result: WindowResult, pose: int) -> WindowResult:
-    """The result scaled about a fixed pose such that the median depth of the anchors that it sees is what it was.
+    """The result scaled about a fixed pose such that the median depth of its anchors is unchanged.
 
-    Between keyframes a false turn makes up several times the true distance, so that no distance may hold the unit of a
-    map that is being straightened.
+    A rotation mistaken for translation changes distances between keyframes several times over, so that none of them can
+    fix the scale while it is corrected.
     """
     seen = problem.obs_anchor[problem.obs_pose == pose]
     if len(seen) == 0:
@@ -31,16 +31,16 @@ def with_same_depths(problem: WindowProblem, result: WindowResult, pose: int) ->
 
 
 def with_same_way(problem: WindowProblem, result: WindowResult, pose: int) -> WindowResult:
-    """The result scaled about a fixed pose such that the way of all but the newest keyframes is as long as it was.
+    """The result scaled about a fixed pose such that the path length of all but the newest keyframes is unchanged.
 
-    The pose that is farthest away is mostly one of the newest, and a map drifts there: where its distance held the
-    unit, telemetry that takes back a drift would shrink all the rest of the map instead. Unchanged where there are
-    too few older ones, or they stand.
+    The farthest pose is mostly one of the newest, where a map drifts: if its distance fixed the scale, a correction of
+    the drift by telemetry would shrink the rest of the map instead. Unchanged if there are too few older keyframes or
+    they are static.
 
     Args:
-        problem: Free poses in the order of time, with a fixed one before them.
-        result: Of it.
-        pose: Number of the fixed one.
+        problem: Free poses in temporal order, after a fixed one.
+        result: Its refined state.
+        pose: Index of the fixed pose.
     """
     order = [pose, *range(pose - _NEWEST)]
     if len(order) < _LEAST_WAY:

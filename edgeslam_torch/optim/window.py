@@ -25,7 +25,7 @@ class State:
     T_c_w: FloatArray
     """``(W, 4, 4)``."""
     x: tuple[FloatArray, ...]
-    """``(B, m)`` of each kind."""
+    """``(B, m)`` blocks of each kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class System:
     g: FloatArray
     """``(6 F,)``."""
     blocks: tuple[Normal, ...]
-    """Of each kind."""
+    """Normal equations of each kind of blocks."""
 
 
 class Window:
@@ -84,7 +84,7 @@ class Window:
         S[np.diag_indices_from(S)] += mu * diagonal + _FLOOR
         delta = np.zeros(len(right))
         if len(delta):
-            # LAPACK reads columns: what is the upper triangle to numpy is the lower one to it.
+            # LAPACK is column-major: numpy's upper triangle is its lower one.
             L, failed = lapack.dpotrf(S.T, lower=1, overwrite_a=1)
             if failed:
                 return None
@@ -104,7 +104,7 @@ class Window:
         return Step(State(T, tuple(x)), predicted, size)
 
     def refine(self) -> WindowResult:
-        """Run the loop and report."""
+        """Run the solver and collect the result."""
         system, summary = minimise(self, self.start, self.config)
         normal: dict[Blocks, Normal] = dict(zip(self.blocks, system.blocks, strict=True))
         x: dict[Blocks, FloatArray] = dict(zip(self.blocks, system.state.x, strict=True))

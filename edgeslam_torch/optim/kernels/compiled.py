@@ -1,4 +1,4 @@
-"""Plain loops compiled by numba: one thread, sums in the order in which they are written, on every processor alike.
+"""Plain loops compiled by numba: single-threaded, with a fixed order of summation, so that results are reproducible.
 
 A compiled function calls compiled functions of its own file only: numba's cache notices changes of that file alone.
 """
@@ -16,20 +16,20 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
-    """The function, compiled at its first call for the types that it is given.
+    """The function, compiled at its first call for the types of its arguments.
 
     Machine code is cached beside the file or, where that cannot be written, in the user's cache directory
-    (``NUMBA_CACHE_DIR`` chooses another); where none can be written, every process compiles anew.
+    (``NUMBA_CACHE_DIR`` overrides it); if none is writable, every process compiles again.
     """
     settings: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     try:
         return cast(Function, numba.njit(cache=True, **settings)(function))
-    except RuntimeError:  # no directory that can be written
+    except RuntimeError:  # no writable cache directory
         return cast(Function, numba.njit(**settings)(function))
 
 
 class _Notice(event.Listener):
-    """Says once that a first call takes long."""
+    """Logs once that the first call compiles, which takes long."""
 
     said = False
 

@@ -1,8 +1,8 @@
-"""Edge pixels seen from other poses: the distance across the edge there and the depth cycle, paper eqs. (17)-(23).
+"""Edge pixels projected into other poses: distance across the edge and depth cycle, paper eqs. (17)-(23).
 
 `losses.edge_alignment` and `losses.cycle` define them. A pixel with the ray :math:`u` and the inverse depth :math:`d`
 in its host lies at :math:`q = R u + d t` in the target, up to the factor :math:`1/d`: points at infinity need no
-special case. Derivatives are by the left tangent of the relative pose, six numbers whatever the window's size.
+special case. Derivatives are by the left tangent of the relative pose, six parameters for any window size.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from edgeslam_torch.optim.kernels.compiled import compiled
 from edgeslam_torch.types import FloatArray, IntArray
 
 MIN_DEPTH = 1e-6
-"""A point nearer than this lies behind the camera; of points divided by their depth in the host."""
+"""Minimum depth of a point in front of the camera, relative to its depth in the host."""
 NONE, RELATIVE_DEPTH, PIXEL = range(3)
 """Forms of the cycle."""
 
@@ -42,15 +42,15 @@ def edges(
         inverse_depth: ``(E,)`` there.
         uv_j: ``(P, 2)`` partners in the target.
         normal_j: ``(P, 2)`` their unit normals.
-        inv_sigma: ``(P,)`` across the edge [1/px].
-        inverse_depth_j: ``(P,)`` inverse depth that the target holds for the partner; 0 for none.
+        inv_sigma: ``(P,)`` inverse standard deviation across the edge [1/px].
+        inverse_depth_j: ``(P,)`` the target's inverse depth of the partner; 0 for none.
         cycle: Form of the cycle: `NONE`, `RELATIVE_DEPTH` or `PIXEL`.
-        cycle_inv_sigma: Of it.
+        cycle_inv_sigma: Inverse standard deviation of the cycle, in its own unit.
         K: fx, fy, cx, cy [px].
 
     Returns:
         Residuals ``(P, 1 + cycle)``: alignment, then the cycle; derivatives ``(P, 1 + cycle, 7)`` by the relative
-        pose's left tangent and by the inverse depth; and ``(P,)``.
+        pose's left tangent and by the inverse depth; and ``(P,)`` whether each is in front of the camera.
     """
     fx, fy, cx, cy = K
     r, J = np.zeros((len(view), 1 + cycle)), np.zeros((len(view), 1 + cycle, 7))
@@ -86,7 +86,7 @@ def edges(
             slope = -2.0 * held * both * both * cycle_inv_sigma  # by iz
             J[k, 1, 2], J[k, 1, 3], J[k, 1, 4] = -slope * iz * iz, -slope * iz * y, slope * iz * x
             J[k, 1, 6] = slope * scale * (1.0 - iz * T[2, 3])
-        if cycle == PIXEL and held > 0.0:  # to the held depth and back into the host
+        if cycle == PIXEL and held > 0.0:  # to the target's depth and back into the host
             px, py, pz = x - T[0, 3] * held, y - T[1, 3] * held, 1.0 - T[2, 3] * held
             Z = T[0, 2] * px + T[1, 2] * py + T[2, 2] * pz
             if not Z > MIN_DEPTH:
@@ -96,9 +96,9 @@ def edges(
                 f *= cycle_inv_sigma
                 back = (T[0, i] * px + T[1, i] * py + T[2, i] * pz) / Z
                 r[k, 1 + i] = (back - at) * f
-                for m in range(3):  # by the point at the held depth, in the target
+                for m in range(3):  # by the point at the target's depth
                     D[m] = (T[m, i] - back * T[m, 2]) * f / Z
-                # The projected pixel moves with the pose, and the way back moves against it.
+                # The projection depends on the pose, and the back-projection on its inverse: opposite signs.
                 J[k, 1 + i, 0] = D[0] * (iz - held)
                 J[k, 1 + i, 1] = D[1] * (iz - held)
                 J[k, 1 + i, 2] = -(D[0] * x + D[1] * y) * iz - D[2] * held

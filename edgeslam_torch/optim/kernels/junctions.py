@@ -1,7 +1,7 @@
-"""L-junctions seen from other poses: the corner, and its arms or the angle between them, paper eqs. (24)-(25).
+"""L-junctions projected into other poses: corner, and arms or the angle between them, paper eqs. (24)-(25).
 
-`losses.lshape.junction_residuals` defines them. Corner and arm ends have an inverse depth each and lie in the target as
-`optim.kernels.edges` has it.
+`losses.lshape.junction_residuals` defines them. Corner and arm ends have an inverse depth each and project as in
+`optim.kernels.edges`.
 """
 
 import math
@@ -15,7 +15,7 @@ from edgeslam_torch.types import FloatArray, IntArray
 MIN_DEPTH = 1e-6
 """As in `optim.kernels.edges`."""
 MIN_ARM_PX = 1e-6
-"""Arms are not divided by less."""
+"""Minimum divisor for the length of an arm."""
 
 
 @compiled
@@ -42,14 +42,14 @@ def junctions(
         inverse_depth: ``(C, 3)`` there.
         uv_j: ``(Q, 2)`` the corner in the target.
         arms_j: ``(Q, 2, 2)`` unit directions of the arms there.
-        inv_sigma_px: Of a corner [1/px].
-        inv_sigma_angle: Of an angle row.
-        cosines: One row, the cosine between the arms, instead of the sine between each and the seen one.
+        inv_sigma_px: Inverse standard deviation of a corner [1/px].
+        inv_sigma_angle: Inverse standard deviation of an angle row.
+        cosines: One row, the cosine between the arms, instead of the sine between each arm and the observed one.
         K: fx, fy, cx, cy [px].
 
     Returns:
         Residuals ``(Q, 3 or 4)``: corner u and v, then the angle rows; derivatives ``(Q, 3 or 4, 9)`` by the relative
-        pose's left tangent and by the three inverse depths; and ``(Q,)``.
+        pose's left tangent and by the three inverse depths; and ``(Q,)`` whether each is in front of the camera.
     """
     fx, fy, cx, cy = K
     rows = 3 if cosines else 4

@@ -1,11 +1,11 @@
-"""Normal equations of blocks (anchors, inverse depths) that poses see, their elimination and back-substitution.
+"""Normal equations of poses and landmark blocks (anchors, inverse depths), Schur complement and back-substitution.
 
 With residuals :math:`r`, derivatives :math:`J_x` by poses and :math:`J_y` by blocks, and robust weights :math:`w`,
 
 .. math:: \\begin{pmatrix} H & W^T \\\\ W & V \\end{pmatrix} \\begin{pmatrix} \\delta \\\\ y \\end{pmatrix}
    = -\\begin{pmatrix} g_x \\\\ g_y \\end{pmatrix}, \\qquad V = \\sum w J_y^T J_y, \\quad W = \\sum w J_y^T J_x .
 
-V consists of one small matrix a block, so that the poses' steps follow from :math:`S = H - W^T V^{-1} W` alone.
+V is block-diagonal, so that the poses' steps follow from the Schur complement :math:`S = H - W^T V^{-1} W`.
 """
 
 import math
@@ -19,7 +19,7 @@ from edgeslam_torch.types import FloatArray, IntArray
 L2, HUBER, CAUCHY, TUKEY = range(4)
 """Robust kernels, in the order of `losses.robust.Kernel`."""
 PIVOT = 1e-12
-"""A pivot below this fraction of its diagonal entry is a direction that nothing observes."""
+"""Pivot, relative to its diagonal entry, below which a direction is unobserved."""
 
 
 @compiled
@@ -61,12 +61,12 @@ def accumulate(
         r: Whitened residuals ``(n, k)``.
         J: Their derivatives ``(n, k, 6 + m)`` by the pose and the block.
         front: ``(n,)`` which lie in front of the camera.
-        far: ``(n,)`` square of one that does not, and the largest that counts: farther ones have no weight.
-        joint: Whether the k rows are one measurement, with one weight, or each has its own.
+        far: ``(n,)`` squared residual assigned behind the camera, and the largest with a non-zero weight.
+        joint: Whether the k rows are one measurement with a common weight, or have one each.
         kernel: Robust kernel.
         delta: Its width.
-        block: ``(n,)`` of each.
-        view: ``(n,)`` row of ``H`` and ``g_pose``; -1 for a pose that does not move.
+        block: ``(n,)`` block of each residual.
+        view: ``(n,)`` row of ``H`` and ``g_pose``; -1 for a fixed pose.
         slot: ``(n,)`` row of ``W``; not read where ``view`` is -1.
         V: ``(B, m, m)`` of the blocks, added to.
         g: ``(B, m)`` their gradients, added to.
@@ -116,15 +116,15 @@ def coupled(
     host_slot: IntArray,
     W: FloatArray,
 ) -> None:
-    """Carry couplings with relative poses to those with hosts and targets: ``xi = xi_target - Ad xi_host``.
+    """Transform couplings with relative poses to couplings with hosts and targets: ``xi = xi_target - Ad xi_host``.
 
     Args:
         relative: ``(P, m, 6)`` couplings of pairs.
         adjoint: ``(R, 6, 6)`` of the relative poses.
-        block: ``(P,)``.
+        block: ``(P,)`` blocks.
         view: ``(P,)`` relative poses.
-        target_slot: ``(P,)`` rows of ``W``; -1 for a target that does not move.
-        host_slot: ``(B,)`` the same of the hosts.
+        target_slot: ``(P,)`` rows of ``W``; -1 for a fixed target.
+        host_slot: ``(B,)`` the same for the hosts.
         W: ``(S, m, 6)``, added to.
     """
     for p in range(len(relative)):
@@ -149,21 +149,21 @@ def eliminate(
     S: FloatArray,
     right: FloatArray,
 ) -> FloatArray:
-    """Take blocks out of the poses' system.
+    """Eliminate blocks from the poses' system (Schur complement).
 
     Args:
         V: ``(B, m, m)``, where m is 1 or 3.
         g: ``(B, m)``.
         W: ``(S, m, 6)``, block by block.
         start: ``(B + 1,)`` first row of ``W`` of each block.
-        column: ``(S,)`` pose of each row, rising within a block.
+        column: ``(S,)`` pose of each row, ascending within a block.
         mu: Damping relative to the diagonal of ``V``.
         S: ``(6 F, 6 F)``; on and above its diagonal, ``W^T V^-1 W`` is subtracted.
         right: ``(6 F,)``; ``W^T V^-1 g`` is subtracted.
 
     Returns:
         ``(B, m, m)`` Cholesky factors of the damped blocks, below the diagonal; on it the pivots' reciprocal roots,
-        zero in directions that nothing observes: they neither move nor affect the poses.
+        zero in unobserved directions, which neither move nor affect the poses.
     """
     m = V.shape[1]
     factor = np.zeros(V.shape)
@@ -205,7 +205,7 @@ def eliminate(
                 to, A, B = 6 * column[first + t], Y[s], Y[t]
                 for c in range(6):
                     S_row = S[row + c]
-                    if m == 3:  # written out: half the time of a loop
+                    if m == 3:  # unrolled: half the time of a loop
                         u, v, w = A[0, c], A[1, c], A[2, c]
                         for d in range(6):
                             S_row[to + d] -= u * B[0, d] + v * B[1, d] + w * B[2, d]
@@ -219,7 +219,7 @@ def eliminate(
 def back_substitute(
     factor: FloatArray, g: FloatArray, W: FloatArray, start: IntArray, column: IntArray, delta: FloatArray
 ) -> FloatArray:
-    """Steps of the blocks ``(B, m)`` that belong to the poses' ``delta (F, 6)``: ``-V^-1 (g + W delta)``."""
+    """Steps of the blocks ``(B, m)`` for the poses' ``delta (F, 6)``: ``-V^-1 (g + W delta)``."""
     m = g.shape[1]
     step = np.empty(g.shape)
     for b in range(len(g)):

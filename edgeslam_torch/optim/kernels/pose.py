@@ -1,4 +1,4 @@
-"""Normal equations of one pose that sees fixed points."""
+"""Normal equations of one pose against fixed points."""
 
 import math
 
@@ -9,7 +9,7 @@ from edgeslam_torch.optim.kernels.compiled import compiled
 from edgeslam_torch.types import FloatArray
 
 FAR_SIGMA = 1000.0
-"""A point behind the camera costs as much as an error of so many standard deviations."""
+"""Residual of a point behind the camera [standard deviations]."""
 
 
 @compiled
@@ -25,19 +25,19 @@ def pose_equations(
     limit: float,
     min_depth: float,
 ) -> tuple[FloatArray, FloatArray, float, FloatArray]:
-    """Sum the points in use.
+    """Sum the normal equations over the points in use.
 
     Args:
         T_c_w: Pose ``(4, 4)``.
         p_w: Points ``(N, 3)``.
         uv: Their undistorted pixels ``(N, 2)``.
         inv_sigma: Inverse standard deviations ``(N,)`` [1/px].
-        slack: Further standard deviation along one direction ``(N, 2)`` [px].
+        slack: Additional standard deviation along one direction ``(N, 2)`` [px].
         K: fx, fy, cx, cy [px].
-        use: ``(N,)`` which points count.
-        robust: Huber's kernel from ``limit`` on instead of squares.
+        use: ``(N,)`` points in use.
+        robust: Huber's kernel with threshold ``limit`` instead of squares.
         limit: Squared whitened residual.
-        min_depth: A point nearer than this lies behind the camera.
+        min_depth: Minimum depth of a point in front of the camera.
 
     Returns:
         Normal matrix ``(6, 6)``, gradient ``(6,)``, cost, and squared whitened residuals of all points ``(N,)``,
@@ -60,7 +60,7 @@ def pose_equations(
         x, y = X * iz, Y * iz
         a, b = fx * inv_sigma[n], fy * inv_sigma[n]
         r, s = a * x + (cx - uv[n, 0]) * inv_sigma[n], b * y + (cy - uv[n, 1]) * inv_sigma[n]
-        # Whitened by the inverse root of I + l l^T, which shortens what lies along l.
+        # Whitened by the inverse root of I + l l^T, which shortens components along l.
         u, v = slack[n, 0] * inv_sigma[n], slack[n, 1] * inv_sigma[n]
         length2 = u * u + v * v
         shorter = (1.0 - 1.0 / math.sqrt(1.0 + length2)) / length2 if length2 > 0.0 else 0.0

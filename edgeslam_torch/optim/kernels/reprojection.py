@@ -1,4 +1,4 @@
-"""Reprojection of anchors and what is known of their depths, paper eqs. (15)-(16); `losses.reprojection` defines it.
+"""Reprojection and depth priors of anchors, paper eqs. (15)-(16); `losses.reprojection` defines the former.
 
 With the point :math:`P = R p + t` in the camera, its normalised coordinates :math:`x = X/Z, y = Y/Z` and a left tangent
 :math:`(\\rho, \\phi)` of the pose, :math:`dP = \\rho + \\phi \\times P + R\\, dp`.
@@ -11,7 +11,7 @@ from edgeslam_torch.optim.kernels.compiled import compiled
 from edgeslam_torch.types import FloatArray, IntArray
 
 MIN_DEPTH = 1e-6
-"""A point nearer than this lies behind the camera [map units]."""
+"""Minimum depth of a point in front of the camera [map units]."""
 
 
 @compiled
@@ -29,14 +29,15 @@ def reprojection(
     Args:
         T_c_w: World-to-camera poses ``(W, 4, 4)``.
         p_w: Anchors ``(A, 3)``.
-        pose: ``(O,)`` which pose saw it.
-        anchor: ``(O,)`` which anchor was seen.
+        pose: ``(O,)`` observing pose.
+        anchor: ``(O,)`` observed anchor.
         uv: ``(O, 2)`` undistorted pixels.
-        inv_sigma: ``(O,)`` [1/px].
+        inv_sigma: ``(O,)`` inverse standard deviations [1/px].
         K: fx, fy, cx, cy [px].
 
     Returns:
-        Residuals ``(O, 2)``; derivatives ``(O, 2, 9)`` by the pose's left tangent and by the anchor; and ``(O,)``.
+        Residuals ``(O, 2)``; derivatives ``(O, 2, 9)`` by the pose's left tangent and by the anchor; and ``(O,)``
+        whether each is in front of the camera.
     """
     fx, fy, cx, cy = K
     r, J, front = np.zeros((len(pose), 2)), np.zeros((len(pose), 2, 9)), np.zeros(len(pose), np.bool_)
@@ -67,13 +68,13 @@ def reprojection(
 def inverse_depth(
     T_c_w: FloatArray, p_w: FloatArray, pose: IntArray, anchor: IntArray, prior: FloatArray, inv_sigma: FloatArray
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Whitened inverse depth minus what is expected of it; arguments and results as `reprojection`, one row each.
+    """Whitened predicted minus expected inverse depth; arguments and results as `reprojection`, one row each.
 
     Args:
         T_c_w: World-to-camera poses ``(W, 4, 4)``.
         p_w: Anchors ``(A, 3)``.
-        pose: ``(D,)`` in which camera.
-        anchor: ``(D,)`` of which anchor.
+        pose: ``(D,)`` host poses.
+        anchor: ``(D,)`` anchors.
         prior: ``(D,)`` expected inverse depth [1/map unit].
         inv_sigma: ``(D,)`` its inverse standard deviation [map units].
     """
