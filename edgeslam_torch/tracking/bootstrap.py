@@ -28,7 +28,8 @@ from edgeslam_torch.types import FloatArray, Frame, IntArray
 logger = logging.getLogger(__name__)
 
 WITNESS_SHARE = 0.6
-"""Minimum share of inliers in the frames between: correct structures reach 0.8 to 0.95 (95 % of correct matches)."""
+"""Minimum share of inliers in the intermediate frames: correct structures reach 0.8 to 0.95 (95 % of correct
+matches)."""
 
 MAX_COST_RATIO = 1.2
 """Maximum ratio of the costs of two structures that both explain the images: four standard deviations of a chi-square
@@ -73,7 +74,7 @@ class StartedMap:
 
 
 class Bootstrap:
-    """An attempt to initialise: a reference keyframe with predicted depths, and the frames tracked against it."""
+    """Initialisation from a reference keyframe with predicted depths and the frames tracked against it."""
 
     def __init__(
         self,
@@ -86,17 +87,17 @@ class Bootstrap:
         seed: int = 0,
         corner: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Begin with a map of predicted depths.
+        """Start with a map of predicted depths.
 
         Args:
             slam_map: Map to which the reference and its anchors are added.
-            tracker: Finds them in the frames that follow.
+            tracker: Tracks them in the following frames.
             config: Thresholds.
             reference: First keyframe.
             guess: Depth of its keypoints [map units] and log standard deviation ``(N, 2)``.
             colour: RGB of its keypoints ``(N, 3)``.
-            seed: Of the essential matrix's random samples.
-            corner: Which of its keypoints are corners ``(N,)``, see `are_corners`; None: all.
+            seed: Seed of the essential matrix's random samples.
+            corner: Mask ``(N,)`` of its keypoints that are corners, see `are_corners`; None: all.
         """
         self.map = slam_map
         self.tracker = tracker
@@ -146,14 +147,14 @@ class Bootstrap:
     def two_views(self, frame_index: int, view: View, track: Track, corner: NDArray[np.bool_] | None = None) -> TwoView:
         """Store the frame's matches and try to triangulate those of corners with the reference.
 
-        Keypoints on edges fit every motion along them, and with a sharp minimum: hundreds on a wall of panels leave the
-        essential matrix 20 degrees and a factor of 2.4 off.
+        Keypoints on edges slide along them (aperture problem): hundreds on a panelled wall fit an essential matrix of a
+        wrong motion, with a sharp minimum.
 
         Args:
-            frame_index: Of the frame.
+            frame_index: Index of the frame.
             view: Its features.
             track: Its matches.
-            corner: Which of its keypoints are corners ``(N,)``; None: all.
+            corner: Mask ``(N,)`` of its keypoints that are corners; None: all.
         """
         reference_keypoint = self._reference_keypoints(track)
         self.views.append(
@@ -244,9 +245,9 @@ class Bootstrap:
         return replace(two_view, T_c_w=T_c_r @ self.reference.T_c_w, p_w=se3.transform(self.reference.T_w_c, p_r))
 
     def wait(self, frame: Frame, view: View, track: Track) -> None:
-        """Keep every few frames; beyond the limit, drop the one nearest to its neighbours.
+        """Store every few frames; above the limit, remove the one nearest to its neighbours.
 
-        Otherwise two nearby keyframes alone would constrain the first seconds of the map.
+        They become keyframes; otherwise only two nearby ones would constrain the first seconds of the map.
         """
         last = self.waiting[-1].frame if self.waiting else None
         if frame.stamp_s - (self.reference.stamp_s if last is None else last.stamp_s) < self.config.keyframe_gap_s:
@@ -288,7 +289,7 @@ class Bootstrap:
         return StartedMap(new, {reference.frame_index: reference.T_c_w} | poses)
 
     def adopt(self, frame: Frame, view: View, track: Track) -> StartedMap:
-        """Keep the predicted map, with the frames so far as its keyframes; its depths rest on their priors.
+        """Keep the predicted map with its depth priors; the frames so far become keyframes.
 
         Args:
             frame: The current frame.

@@ -1,8 +1,8 @@
 """The pose of a frame from edges, used where corners are few.
 
 An edge pixel constrains the pose across the edge but not along it. Edge points of nearby keyframes are projected into
-the frame and associated with the nearest Canny pixel; `refine_pose` gets a large slack along the edge. Points are
-used beside them, if any. REVO (Schenk and Fraundorfer, ICRA 2017) and the edgelets of SVO track by the same distance.
+the frame and associated with the nearest Canny pixel; `refine_pose` gets a large slack along the edge. Points, if any,
+are used as well. REVO (Schenk and Fraundorfer, ICRA 2017) and the edgelets of SVO use the same distance.
 """
 
 from dataclasses import dataclass
@@ -107,7 +107,7 @@ class EdgeTracker:
         points: PointsInFrame | None = None,
         expected: TrackingPrior | None = None,
     ) -> EdgePose | None:
-        """Pose near a predicted one from edges, beside points; None without measured edges or with too few inliers.
+        """Pose near a predicted one from edges and points; None without measured edges or with too few inliers.
 
         Args:
             grey: Frame ``(H, W)`` with the lens distortion still in it.

@@ -130,9 +130,9 @@ def join(track: Track, followed: Followed, view: View, scale_factor: float) -> T
 def with_followed(view: View, followed: Followed, words: NDArray[np.uint64]) -> tuple[FrameFeatures, Track]:
     """A frame's features with flow's pixels after them, and flow's track on these.
 
-    For a frame that must become a keyframe although none of its corners matches: the clearest corners of the image have
-    just come into view, and the detector has none left for the fainter ones that flow still holds. Their pixels drift a
-    little, but without them the new corners cannot be placed in the map.
+    For a frame that must become a keyframe although none of its corners matches: the strongest corners have just come
+    into view, and the detector's limit excludes the weaker ones that flow still tracks. Flow drifts slightly, but
+    without these observations the new corners have no connection to the map.
 
     Args:
         view: The frame's features.
@@ -185,7 +185,7 @@ class FlowTracker:
         track, uv = self._locate(template, grey, visible, guess, T_c_w, near, expected)
         if track.inliers < NEAR_SHARE * len(wanted) and near < self.config.levels:
             far = self._locate(template, grey, visible, guess, T_c_w, self.config.levels, expected)
-            # Patches of coarse levels reach past the border of the image: keypoints near it are found on the fine ones.
+            # Patches of coarse levels extend beyond the image: keypoints near its border are found on fine levels.
             track, uv = far if far[0].inliers >= least else max(far, (track, uv), key=lambda tried: tried[0].inliers)
         if track.inliers < self.min_inliers:
             return None

@@ -1,8 +1,8 @@
 """Two-view initialisation of a map that starts with predicted depths.
 
-The first frame gets a map at once: every keypoint at the depth predicted by the network (or a constant without one).
+The first frame creates a map: every keypoint at the depth predicted by the network (or a constant without one).
 Frames are tracked against it until one has enough parallax; the essential matrix then gives structure that depends on
-the prediction only by its scale. It is rejected unless the frames in between, which are independent of it, agree.
+the prediction only by its scale. It is rejected unless the intermediate frames, which are independent of it, agree.
 """
 
 from dataclasses import dataclass, field, replace
@@ -40,7 +40,7 @@ class BootstrapView:
 
 @dataclass(frozen=True, slots=True)
 class TwoView:
-    """Structure from the reference keyframe and the current frame; ``reason`` says why there is none."""
+    """Structure from the reference keyframe and the current frame; ``reason`` explains a missing one."""
 
     ok: bool
     reason: str
@@ -107,7 +107,7 @@ def two_view_map(
 def poses_of_witnesses(
     views: list[BootstrapView], point_of_keypoint: FloatArray, camera: Camera
 ) -> tuple[list[FloatArray], float]:
-    """Poses of the frames in between against the new points, and their median share of inliers.
+    """Poses of intermediate frames against the new points, and their median share of inliers.
 
     Args:
         views: Frames tracked since the reference keyframe.
@@ -156,19 +156,19 @@ def consensus(
     camera: Camera,
     max_views: int = 6,
 ) -> Consensus:
-    """Refine the two views jointly with some of the frames between, which observe the same points.
+    """Refine the two views jointly with some intermediate frames, which observe the same points.
 
-    Two views with a short baseline hardly distinguish rotation from translation, and RANSAC picks either; the frames
-    between average the detector's noise, and the covariance shows whether that suffices.
+    Two views with a short baseline hardly distinguish rotation from translation, and RANSAC selects either at random;
+    intermediate frames average the detector's noise, and the covariance shows whether that suffices.
 
     Args:
         reference: First keyframe; its pose is fixed.
         two_view: From `two_view_map`.
         view: Current frame.
-        views: Frames between, in order.
+        views: Intermediate frames, in order.
         poses: Their world-to-camera poses against the two-view points.
         camera: Intrinsics.
-        max_views: Maximum number of frames between, evenly spread.
+        max_views: Maximum number of intermediate frames, evenly spread.
     """
     chosen: IntArray = (
         np.unique(np.linspace(0, len(views) - 1, min(max_views, len(views))).astype(int)) if views else np.zeros(0, int)

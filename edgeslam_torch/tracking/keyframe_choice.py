@@ -17,11 +17,11 @@ SHORTEST_GAP_S = 0.04
 """Minimum time between keyframes whatever the change of view: every second frame at 30 Hz, every frame at 20."""
 
 OLD_S = 10.0
-"""Age from which on a keyframe belongs to an earlier visit; younger ones of a shaking hand or of a rotation in place
+"""Age from which on a keyframe belongs to an earlier visit; more recent ones, of a shaking hand or a rotation in place,
 are other views of the same visit, which improve the map (docs/decisions/03-keyframes.md)."""
 KNOWN_SHARE = 0.8
-"""Share of a view already covered by earlier visits from which on a keyframe is redundant: 0.81 and more from the third
-pass over a place on, below 0.05 in new places."""
+"""Share of a view covered by earlier visits above which a keyframe is redundant: at least 0.81 from the third visit of
+a place on, below 0.05 in new places."""
 VISITS = 10
 """Number of keyframes of earlier visits that are compared, the most covisible ones."""
 LONG_AGO_S = 30.0
@@ -29,9 +29,9 @@ LONG_AGO_S = 30.0
 MAX_VIEW_ANGLE_RAD = np.deg2rad(15.0)
 """Angle between two views of a place up to which their keypoints are recognised."""
 MAX_LEVEL_DIFFERENCE = 2
-"""Difference of pyramid levels up to which they are."""
+"""Maximum difference of pyramid levels for recognition."""
 CHANCE = 0.05
-"""Probability below which missing anchors indicate a change of the place."""
+"""Significance level at which missing anchors indicate a change of the place."""
 
 
 def lost_sight(followed: Followed, config: MappingConfig) -> bool:
@@ -40,7 +40,7 @@ def lost_sight(followed: Followed, config: MappingConfig) -> bool:
 
 
 def lost_most(followed: Followed, config: MappingConfig) -> bool:
-    """Whether so few keypoints of the last keyframe are tracked that the next one cannot wait: a fast rotation."""
+    """Whether flow tracks so few keypoints of the last keyframe that the next one is due at once: a fast rotation."""
     return followed.share < config.keyframe_at_once
 
 
@@ -68,7 +68,7 @@ def is_due(
         parallax_rad: Median ray angle to the reference keyframe.
         since_keyframe_s: Time since the last one.
         config: Thresholds.
-        at_once: Do not wait for ``keyframe_min_gap_s``: `lost_most`.
+        at_once: Ignore ``keyframe_min_gap_s``: `lost_most`.
     """
     if since_keyframe_s < (SHORTEST_GAP_S if at_once else config.keyframe_min_gap_s):
         return False
@@ -84,18 +84,18 @@ def known_share(
 ) -> float:
     """Share of a view, in cells with keypoints, that keyframes of earlier visits cover.
 
-    Two kinds of cells are known. A triangulated anchor was found in it that a keyframe of an earlier visit has seen at
-    less parallax than makes a keyframe, and less than a pyramid level nearer or farther: a keyframe here would see
-    nothing new of it. Or a keyframe of long ago has seen anchors that belong there, from a side that looks alike,
-    whether they are found this time or not: a third of them is, on ground that has not changed.
+    A cell is covered if a triangulated anchor is found in it that a keyframe of an earlier visit observed with less
+    parallax than the keyframe threshold and within a pyramid level, so that a new keyframe would add nothing; or if a
+    keyframe of a completed visit observed anchors that project there, from a similar direction, found now or not: in an
+    unchanged place only a third of them is found again.
 
     Args:
         track: Anchors found in the frame.
         uv: All keypoints of the frame ``(N, 2)``.
-        stamp_s: Of the frame.
-        slam_map: With the keyframes.
-        camera: Of the frame.
-        config: Whose parallax makes a keyframe.
+        stamp_s: Stamp of the frame.
+        slam_map: Holds the keyframes.
+        camera: Intrinsics of the frame.
+        config: Thresholds.
     """
     triangulated = ~slam_map.anchors.from_depth[track.anchor]
     anchor, keypoint = track.anchor[triangulated], track.keypoint[triangulated]
@@ -114,7 +114,7 @@ def known_share(
 def _seen_by(
     keyframes: list[Keyframe], T_c_w: FloatArray, slam_map: SlamMap, max_rad: float, levels: int
 ) -> NDArray[np.bool_]:
-    """Which anchors are triangulated and observed from a similar direction and distance."""
+    """Mask of anchors that are triangulated and observed from a similar direction and distance."""
     anchors, centre = slam_map.anchors, se3.inverse(T_c_w)[:3, 3]
     seen = np.zeros(len(anchors.alive), dtype=bool)
     for keyframe in keyframes:
@@ -129,7 +129,7 @@ def _seen_by(
 
 
 def _as_expected(expected: IntArray, track: Track, slam_map: SlamMap, camera: Camera) -> NDArray[np.bool_]:
-    """Cells in which anchors ``(M,)`` are expected, without those where significantly many are missing."""
+    """Cells in which anchors ``(M,)`` are expected, except those where a significant number is missing."""
     p_c = se3.transform(track.T_c_w, slam_map.anchors.p_w[expected])
     expected, p_c = expected[p_c[:, 2] > 0], p_c[p_c[:, 2] > 0]
     uv = camera.project(p_c)

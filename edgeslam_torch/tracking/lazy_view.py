@@ -19,7 +19,7 @@ class LazyView:
     Args:
         frame: Image with the lens distortion still in it.
         camera: Its intrinsics.
-        extract: Makes the features of a grey image.
+        extract: Extracts the features of a grey image.
 
     Raises:
         SourceError: If the image is not of the camera's size.

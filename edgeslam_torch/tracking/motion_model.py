@@ -10,7 +10,7 @@ from edgeslam_torch.types import FloatArray
 
 ACCELERATION_M_S2 = 3.0
 ANGULAR_ACCELERATION_RAD_S2 = 20.0
-"""Standard deviations for a hand or a small drone: a lean of 17 degrees; reaching half a turn per second in 0.15
+"""Standard deviations for a hand or a small drone: a tilt of 17 degrees; half a revolution per second within 0.15
 s."""
 
 FADING = 0.8
@@ -47,7 +47,7 @@ class MotionModel:
     def pose_prior(self, stamp_s: float, T_predicted: FloatArray, metres_per_unit: float) -> PosePrior:
         """A predicted pose with its uncertainty due to accelerations since the newest frame."""
         dt = stamp_s - self.stamp_s
-        speed, turn = (SPEED_M_S, ANGULAR_SPEED_RAD_S) if self.velocity_unknown else (0.0, 0.0)  # it may be moving
+        speed, turn = (SPEED_M_S, ANGULAR_SPEED_RAD_S) if self.velocity_unknown else (0.0, 0.0)  # motion is possible
         sigma_t = math.hypot(speed * dt, 0.5 * ACCELERATION_M_S2 * dt**2) / metres_per_unit
         sigma_r = math.hypot(turn * dt, 0.5 * ANGULAR_ACCELERATION_RAD_S2 * dt**2)
         return PosePrior(0, T_predicted, np.diag([sigma_t**-2] * 3 + [sigma_r**-2] * 3))

@@ -1,4 +1,4 @@
-"""Priors on a frame's pose: by the motion model, and by the drone's sensors."""
+"""Priors on a frame's pose from the motion model and from the drone's sensors."""
 
 import math
 from dataclasses import dataclass, replace
@@ -24,12 +24,12 @@ CENTRE_GATE_SHARE = 1.25
 """Gate for the centre, as a share of its maximum error; larger than 1, the bound of a constrained centre."""
 KEPT_SHARE = 0.9
 """Minimum ratio of inliers of a pose constrained by telemetry to those of a free one: fewer inliers mean that images
-contradict the constraint. A climb mistaken for a rotation has as many either way."""
+contradict the constraint. Where images cannot distinguish a climb from a rotation, the numbers are equal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Vertical:
-    """The map's z axis by the drone's attitude."""
+    """The map's z axis from the drone's attitude."""
 
     up_c: FloatArray
     """``(3,)`` in the camera's axes."""
@@ -39,9 +39,9 @@ class Vertical:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """The camera's rotation by the drone's attitude, aligned with the map over the last seconds.
+    """The camera's rotation from the drone's attitude, aligned with the map over the last seconds.
 
-    It moves no pose by itself (docs/decisions/17-images-decide.md).
+    Used as a gate only; it does not correct poses (docs/decisions/17-images-decide.md).
     """
 
     R_c_w: FloatArray
@@ -64,7 +64,7 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """The camera's position by dead reckoning from the poses of the last seconds."""
+    """The camera's position from dead reckoning, starting at the poses of the last seconds."""
 
     R_w_m: FloatArray
     """``(3, 3)`` map to the axes of the drone's world."""
@@ -83,8 +83,7 @@ class Place:
         return bool((np.abs(self._off(T_c_w)) > CENTRE_GATE_SHARE * self.doubt).any())
 
     def applied_to(self, T_c_w: FloatArray) -> FloatArray:
-        """A pose ``(4, 4)`` with its centre at the dead-reckoned one, along the axes along which it is outside the
-        interval."""
+        """A pose ``(4, 4)`` with the dead-reckoned centre along the axes along which it is outside the interval."""
         return self._moved(T_c_w, np.where(self.beyond(T_c_w) != 0, self._off(T_c_w), 0.0))
 
     def constrained(self, T_c_w: FloatArray, start: PosePrior) -> PosePrior:
@@ -95,7 +94,7 @@ class Place:
         return PosePrior(start.pose, self._moved(T_c_w, self.beyond(T_c_w)), information)
 
     def unsure(self, T_c_w: FloatArray) -> FloatArray:
-        """Covariance ``(6, 6)`` to add to the pose constrained in place of one outside: the whole interval."""
+        """Covariance ``(6, 6)`` to add for a constrained pose: the whole interval along the constrained axes."""
         axes, doubt = self._left(T_c_w)
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = (axes * doubt**2) @ axes.T
@@ -118,7 +117,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class SensorPrior:
-    """Attitude and position of a frame by the drone's sensors, at least one of the two."""
+    """Attitude and position of a frame from the drone's sensors, at least one of the two."""
 
     attitude: Attitude | None = None
     place: Place | None = None
@@ -146,7 +145,7 @@ class TrackingPrior:
 
 
 def levelled(expected: PosePrior, vertical: Vertical) -> PosePrior:
-    """A predicted pose with the drone's roll and pitch; its centre and heading stay."""
+    """A predicted pose with the drone's roll and pitch; its centre and heading are unchanged."""
     up, up_c = expected.T_c_w[:3, 2], vertical.up_c
     axis = np.cross(up, up_c)
     sine, cosine = float(np.linalg.norm(axis)), float(up @ up_c)

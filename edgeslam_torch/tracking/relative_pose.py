@@ -48,7 +48,7 @@ def relative_pose(
     inliers = mask.ravel().astype(bool)
     if inliers.sum() < MIN_MATCHES:
         return RelativePose(MotionKind.FEW_MATCHES, np.eye(4), inliers, 0.0)
-    # Cheirality (points in front of both cameras) picks one of the four decompositions.
+    # Cheirality (points in front of both cameras) selects one of the four decompositions.
     _, rotation, t, _ = cv2.recoverPose(E, a[inliers], b[inliers], camera.K)
     R: FloatArray = np.asarray(rotation, dtype=np.float64)
     T_j_i = np.eye(4)

@@ -1,9 +1,9 @@
 """Relocalisation of a frame without a useful prediction, with verification against perceptual aliasing.
 
 A repeated pattern (tiles, shelves, the doors of a corridor) matches a wrong place with dozens of inliers, and mapping
-from there confirms the error. So the number of inliers is no proof. A place is accepted by the share of visible
-anchors that are found, their spread over the image, reachability, absence of an equally good rival, and agreement of
-the following frames.
+from there confirms the error. The number of inliers is therefore insufficient. A place is accepted by the share of
+visible anchors that are found, their spread over the image, reachability, absence of an equally good rival, and
+agreement of the following frames.
 """
 
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ from edgeslam_torch.types import FloatArray
 MIN_MATCHES = 20
 LIKELY_SHARE = 0.12
 """Minimum share of found anchors among those in view (or among the frame's keypoints, if fewer) of a likely place.
-Wrong places reach 0.09 in a corridor whose doors repeat and 0.06 in furnished rooms; right ones have 0.2 and more in
-95 % of frames of an office recording (docs/decisions/18-relocalisation.md)."""
+Wrong places reach 0.09 in a corridor with repeated doors; right ones have at least 0.2 in 95 % of frames of an office
+(docs/decisions/18-relocalisation.md)."""
 SURE_SHARE = 0.2
 """The same for a place within reach that needs no further confirmation. While the reachable region is a single place,
 as in the first 0.2 s, a likely one is accepted."""
@@ -52,7 +52,7 @@ class Reach:
     """Region that the camera can have reached."""
 
     T_c_w: FloatArray
-    """``(4, 4)`` expected pose: by the last velocity, or by telemetry."""
+    """``(4, 4)`` expected pose, from the last velocity or from telemetry."""
     shift_m: float
     """Radius of the region."""
     turn_rad: float
@@ -66,8 +66,8 @@ class Reach:
         return near and turn <= self.turn_rad + MAX_ANGLE_RAD
 
     def leaves_only(self, place: "Place") -> bool:
-        """Whether no other place like this one can be meant: all that is within reach is one place, or it is where the
-        camera is expected and the next one like it is out of reach."""
+        """Whether aliasing is excluded: the reachable region is one place, or the place is where the camera is expected
+        and the next similar one is out of reach."""
         near = self._shift(place.depth)
         if near <= MAX_DISTANCE * place.depth:
             return self.holds(place)
@@ -174,7 +174,7 @@ class Relocaliser:
         return rivals[0] if enough and rivals[0].share >= LIKELY_SHARE else None
 
     def _is_wide(self, place: Place, inliers: int) -> bool:
-        """Whether as many anchors agree, over enough of the image."""
+        """Whether enough anchors agree over enough of the image."""
         return place.track.inliers >= inliers and place.cells >= MIN_CELLS and place.spread >= LIKELY_SPREAD
 
 
@@ -188,7 +188,7 @@ def place_of(tracker: Tracker, view: View, track: Track) -> Place:
 
 
 def cells_of(camera: Camera, uv: FloatArray) -> set[tuple[int, int]]:
-    """Cells of the image that hold a pixel."""
+    """Cells of the image that contain a pixel."""
     cells = (uv // (np.array([camera.width, camera.height]) / GRID)).astype(np.int64)
     return set(map(tuple, cells.tolist()))
 
@@ -197,7 +197,7 @@ def candidates(tracker: Tracker, T_predicted: FloatArray, count: int, attempt: i
     """Keyframes to match: some of the nearest to the prediction first, then the others in rotation.
 
     Args:
-        tracker: With the map to look in.
+        tracker: Holds the map.
         T_predicted: ``(4, 4)`` world-to-camera guess.
         count: Number of keyframes.
         attempt: Frames lost so far; selects the rotation.

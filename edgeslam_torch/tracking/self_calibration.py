@@ -1,8 +1,8 @@
 """Focal length of a camera from its own images: ``E = K^T F K`` must be an essential matrix.
 
-For an unknown camera it takes the place of a guess; a calibration is checked with it.
+For an unknown camera it replaces a guess; a calibration is checked with it.
 
-The paper takes K as known when it needs it to turn F into E. With the principal point at the image's centre, square
+The paper assumes a known K to convert F to E. With the principal point at the image's centre, square
 pixels and one focal length for all images, F of one pair determines the focal length: the two non-zero singular
 values of ``K^T F K`` are equal (Mendonca and Cipolla, CVPR 1999; Sturm, CVPR 2001, gives the same zero in closed
 form). One pair is off by 5 to 50 %, the median of tens of pairs by a few per cent; planes, rotations, forward motion
@@ -38,24 +38,25 @@ _CHECKED_PAIRS = 120
 """Number of keyframe pairs for checking a calibration: half a second of CPU, once per run."""
 _CHECKED_GAPS = (1, 2, 3)
 _MIN_CHECKED = 10
-"""Minimum number of pairs to contradict a calibration; seven pairs may suggest an error of 25 % for a correct one."""
+"""Minimum number of pairs to contradict a calibration; with seven, errors of 25 % occur."""
 _CONTRADICTION_SIGMAS = 2.5
 _CONTRADICTION = 0.15
-"""Minimum relative difference of a contradiction. On eight recordings, right focal lengths are estimated within 7 %
-(1.9 sigma). Of lengths scaled by 0.7 and 1.3, 10 in 15 are detected by fundamental matrices; not on one start of
-icsl_corridor (planes), and euroc_mh05_a, whose strong distortion compensates a wrong length. The map's refinement
-detects them on tum_fr1_xyz, too (1.23 and 0.84 for 1.43 and 0.77), and finds right ones within 1.3 % on five
-recordings and 10 % off on planes (fr3_notexture_a)."""
+"""Minimum relative difference of a contradiction: twice the error of estimates by fundamental matrices, 7 % (1.9
+sigma), and above that of the map's refinement, 1.3 % in general and 10 % on planes. Planes and strong distortion can
+hide a wrong focal length."""
 _MIN_REFINED = 20
-"""Keyframes: a dozen of a sideways step fit half the focal length at other depths, with a meaningless sigma."""
+"""Minimum number of keyframes: a short sideways motion fits half the focal length with other depths, with a meaningless
+sigma."""
 _REFINED_KEYFRAMES, _REFINED_ANCHORS = 40, 600
-"""Of the map, for a refinement with a free focal length: up to 1.5 s of CPU, once per run."""
+"""Maximum numbers of keyframes and anchors for a refinement with a free focal length: up to 1.5 s of CPU, once per
+run."""
 _REFINEMENT = LmConfig(diagnostics=False, max_iterations=30, mu=1e-8, cost_tolerance=1e-6)
 _NEWTON_STEPS, _FOCAL_STEP, _MAX_MOVE, _CONVERGED = 10, 0.04, 0.25, 0.01
-"""Of the log focal length."""
+"""Newton's method for the log focal length: number of steps, step of the numerical derivative, largest change, and
+convergence threshold."""
 _OPTIMISM = 8.0
-"""Ratio of true to formal sigma: 3 to 8 on six recordings with known focal lengths, since errors of the lens and of
-neighbouring views are common."""
+"""Ratio of true to formal sigma, measured as 3 to 8: errors of the lens model and of neighbouring views are
+correlated."""
 _CHI2_MEDIAN = 1.386
 """Median of chi-square with two degrees of freedom."""
 
@@ -187,12 +188,12 @@ def calibration_warning(camera: Camera, keyframes: Sequence[Keyframe], p_w: Floa
 
 
 def focal_from_map(camera: Camera, keyframes: Sequence[Keyframe], p_w: FloatArray) -> FocalEstimate:
-    """Focal length with which the first keyframes and their anchors fit the keypoints best.
+    """Focal length that minimises the reprojection error of the first keyframes and their anchors.
 
-    Newton's method on the cost of the refined map, which is a function of the focal length alone.
+    Newton's method on the cost of the refined map, a function of the focal length alone.
 
     Args:
-        camera: As the map was made with it.
+        camera: Calibration of the map.
         keyframes: In order.
         p_w: Anchors ``(A, 3)`` by id.
     """
@@ -209,7 +210,7 @@ def focal_from_map(camera: Camera, keyframes: Sequence[Keyframe], p_w: FloatArra
         curvature = (less - 2.0 * here.cost_after + more) / _FOCAL_STEP**2
         slope = (more - less) / (2.0 * _FOCAL_STEP)
         move = -slope / curvature if curvature > 0 else -math.copysign(limit, slope)
-        limit = limit / 3.0 if move * last < 0 else limit  # Huber's cost is no parabola: steps overshoot
+        limit = limit / 3.0 if move * last < 0 else limit  # Huber's cost is not quadratic: steps overshoot
         last = move
         log_scale += float(np.clip(move, -limit, limit))
         if abs(move) < _CONVERGED:
@@ -227,7 +228,7 @@ def _refined_with(problem: WindowProblem, camera: Camera, log_scale: float) -> W
 
 
 def _map_problem(camera: Camera, keyframes: Sequence[Keyframe], p_w: FloatArray) -> WindowProblem | None:
-    """Keyframes, and the anchors that most of them see; None if they are few or did not move."""
+    """Keyframes and their most observed anchors; None with too few keyframes or without motion."""
     if len(keyframes) < _MIN_REFINED:
         return None
     observed = [keyframe.keypoints_with_anchor() for keyframe in keyframes]

@@ -1,4 +1,4 @@
-"""The pose of one frame against the local map, so that poses do not chain from frame to frame."""
+"""The pose of one frame against the local map, not against the previous frame, which would accumulate drift."""
 
 import math
 from dataclasses import dataclass
@@ -21,14 +21,14 @@ ROUGH = PoseConfig(rounds=1, robust_rounds=1, iterations=5, cost_tolerance=1e-2)
 """The first pass only brings the local map's anchors into their search radius."""
 
 ENOUGH_FOR_ROUGH = 250
-"""Maximum number of the last frame's anchors in the first pass; more only cost time."""
+"""Maximum number of the last frame's anchors in the first pass; more do not improve it."""
 
 FINE = PoseConfig(rounds=3, robust_rounds=1, cost_tolerance=1e-2)
 """The pass on all matches; its tolerance is 0.1 standard deviations: less than the frame's own noise."""
 
 WIDER = 2.5
-"""Factor on the radius of a second search: 15 px become 37, which are 4 degrees at 525 px: a turn of 120 degrees a
-second at 30 Hz."""
+"""Factor on the radius of a second search: 37 instead of 15 px, 4 degrees at 525 px, a rotation of 120 degrees a second
+at 30 Hz."""
 MIN_ROUGH = 10
 """Inliers of a rough pose from which the local map is searched: 20 equations for 6 unknowns. `min_inliers` decides
 after that search."""
@@ -124,7 +124,7 @@ class Tracker:
         effort: PoseConfig = FINE,
         expected: TrackingPrior | None = None,
     ) -> Track | None:
-        """Match the given anchors around their predicted pixels and refine the pose on what matches."""
+        """Match the given anchors around their predicted pixels and refine the pose on the matches."""
         seen = self.expected(T_c_w, anchor_ids)
         matches = self._match(view, seen, np.full(len(seen.anchor), radius_px))
         return self.solve(view, T_c_w, matches.train, seen.anchor[matches.query], effort, expected)
@@ -155,7 +155,7 @@ class Tracker:
         return track if track.inliers >= self.config.min_inliers else None
 
     def expected(self, T_c_w: FloatArray, anchor_ids: IntArray) -> Projection:
-        """The given anchors that are predicted in view."""
+        """Projection of the given anchors, those in view."""
         anchors = self.map.anchors
         ids = anchor_ids[anchors.alive[anchor_ids]]
         return project_anchors(anchors, ids, T_c_w, self.camera, self.orb.scale_factor, self.orb.levels)
@@ -208,5 +208,5 @@ def median_parallax(p_w: FloatArray, T_c_w: FloatArray, centre_w: FloatArray) ->
     a = p_w + T_c_w[:3, :3].T @ T_c_w[:3, 3]
     b = p_w - centre_w
     dot, aa, bb = (np.einsum("ij,ij->i", x, y) for x, y in ((a, b), (a, a), (b, b)))
-    cosine = float(np.median(dot / np.maximum(np.sqrt(aa * bb), 1e-12)))  # the angle decreases with it
+    cosine = float(np.median(dot / np.maximum(np.sqrt(aa * bb), 1e-12)))  # the angle is monotonic in the cosine
     return math.acos(min(max(cosine, -1.0), 1.0))
