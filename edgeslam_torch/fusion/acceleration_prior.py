@@ -1,7 +1,7 @@
-"""Prior on camera positions from bounded acceleration, once the map has a metric scale.
+"""Prior on camera positions from bounded acceleration, for maps with metric scale.
 
-A keyframe that shares few anchors with its neighbour, and these with no other, has no scale of its own: images allow it
-to be metres away a tenth of a second earlier.
+A keyframe that shares few anchors with its neighbours has no reliable scale of its own: the images alone allow a
+position metres away a tenth of a second earlier.
 """
 
 import numpy as np

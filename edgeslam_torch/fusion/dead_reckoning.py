@@ -1,7 +1,7 @@
 """Dead reckoning of the camera position from the poses of the last seconds.
 
-Horizontally by velocities from the frames of the last second, vertically by height, which drifts less, from those of
-five seconds. The result is an interval, uniform inside, not a Gaussian.
+Horizontal motion comes from velocities since the frames of the last second, vertical motion from height, which drifts
+less, since those of five seconds. The result is an interval with uniform density, not a Gaussian.
 """
 
 import math
@@ -22,7 +22,7 @@ _STAMPED_S = 0.05
 _NOISE_M = 0.05
 """Three standard deviations of a range reading, and of a tracked position."""
 _STEP_M, _STEP_M_S = 0.08, 1.0
-"""Change between two heights that is a step of the floor: noise, and twice the maximum climb rate."""
+"""Minimum height change of a floor step: noise plus twice the maximum climb rate."""
 _HOLE_S = 0.5
 _FEW = 4
 """Minimum number of poses for a comparison of heights: a second of flight."""
@@ -73,7 +73,7 @@ def reckoned(model: TelemetryModel, recent: Sightings, stamp_s: float) -> Reckon
 def _by_height(
     model: TelemetryModel, stamps_s: FloatArray, seen: FloatArray, frame_s: FloatArray
 ) -> tuple[float, float] | None:
-    """The body's height at a moment and its maximum error [m], from its heights ``(S,)`` in the map and the drone's.
+    """The body's height at a frame and its maximum error [m], from its heights ``(S,)`` in the map and telemetry.
 
     None without heights, or after a step of the floor (furniture below) that leaves too few of them.
     """

@@ -6,11 +6,11 @@ All measurements are linear in the positions :math:`p_k` (world axes, map units)
     s\,(p_{k+1} - p_k) = d_k + \epsilon_k, \qquad s\,z_k + c = h_k + \eta_k
 
 with displacements :math:`d` from integrated velocities and heights :math:`h` above a floor whose level :math:`c`
-changes where furniture passes below. The error model: noise of single readings; quantisation, part of whose error
-lasts as long as its reading and the rest for a second; a velocity bias that decays in seconds; and, common to all, the
-scale, the map's tilt, the video's delay and whether the drone rounds or truncates. These nuisance parameters are
-columns of the covariance, so that the solver does not see them. The scale's column is the map's own path :math:`s\,p`:
-with :math:`d` in its place, a map that disagrees would cost less the smaller it is.
+changes where furniture passes below. The error model: noise of single readings; quantisation, partly constant within
+equal readings and partly decorrelating in a second; a velocity bias that decays in seconds; and the common nuisance
+parameters scale, tilt of the map, video delay, and rounding or truncation. The nuisance parameters are columns of the
+covariance, so that the solver does not need them. The scale's column is the map's own path :math:`s\,p`: with :math:`d`
+instead, a contradictory map would cost less the smaller it is.
 """
 
 import math
@@ -28,11 +28,11 @@ from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray, IntArray
 
 BIAS_M_S = 0.015
-"""Standard deviation of the velocity bias, typical of flights (`joint_scale`)."""
+"""Standard deviation of the velocity bias (`joint_scale`)."""
 BIAS_MEMORY_S = 12.0
 _LASTING, _VARIES_S = 0.25, 1.0
-"""Share of a quantisation error's variance that lasts as long as its reading, and correlation time of the rest [s]. The
-mean error over a reading of three seconds is .01 m/s at varying speed; a constant one would be .029."""
+"""Share of a quantisation error's variance that is constant while the reading is, and correlation time of the rest [s].
+Over a reading of three seconds the mean error is .01 m/s at varying speed; for a constant speed it would be .029."""
 SENSOR_M_S = 0.02
 """Noise of one velocity reading before quantisation."""
 HEIGHT_MEMORY_S = 3.0
@@ -46,7 +46,7 @@ DELAY_S = 0.3
 FLOOR_M = 30.0
 """Uninformative prior on the floor's level."""
 UP_RAD = math.radians(2.0)
-"""Error of the direction of gravity in one frame: mount, accelerations."""
+"""Error of the direction of gravity in one frame: mount, acceleration."""
 UP_MEMORY_S = 5.0
 _UNPROVEN_S = 3.0
 """Range of delays to consider before telemetry is validated, as in `comparison`."""
@@ -57,7 +57,8 @@ _STILL_M_S = 0.05
 """Speed along an axis below which the drone is at rest: half a step of the SDK; independent of the map's scale."""
 _LEAST_WEIGHT = 1e-4
 _BENT = 0.2
-"""Share of a path by which the map may be wrong without the reading being an outlier: that is to be corrected."""
+"""Share of a path by which the map may be distorted before a reading counts as an outlier: the reading should correct
+it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,9 +85,9 @@ class UpDirections:
     up_c: FloatArray
     """``(U, 3)`` unit vectors, camera axes."""
     up_m: FloatArray
-    """``(3,)`` the same in the map."""
+    """``(3,)`` the same in map axes."""
     sigma_rad: float
-    """Standard deviation of each, per axis."""
+    """Standard deviation per axis of each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +136,7 @@ class TelemetryModel:
     young: bool = False
     """Whether the map began seconds ago."""
     standing: bool = False
-    """Whether readings of a drone at rest are usable where velocities are not: zero is independent of the scale."""
+    """Whether zero readings are usable although velocities are not: zero is independent of the scale."""
 
     @property
     def knows_metres(self) -> bool:
@@ -279,7 +280,7 @@ class TelemetryModel:
         per_scale = per_scale_w[use, 2]
         per_scale = per_scale - (same @ per_scale) / same.sum(1)
         common = np.column_stack([per_scale, tilt, delay * fast, none])
-        rounded = name == "tof"  # centimetres; the others move in steps or drift
+        rounded = name == "tof"  # quantised to centimetres; the others move in steps or drift
         white = np.full(M, sigma**2 if rounded else 0.25 * sigma**2)
         slow = (0.1 if rounded else 1.0) * lasting + level
         return _Rows(D, h, white, slow, common, np.arange(M), np.abs(rise))
@@ -309,12 +310,12 @@ class TelemetryModel:
 
 
 def is_steady(track: TelemetryTrack, at_s: FloatArray) -> NDArray[np.bool_]:
-    """Whether a drone leans no more than in take-off around moments ``(N,)``, for any plausible delay."""
+    """Whether the drone leans no more than in take-off around times ``(N,)``, for any plausible delay."""
     return np.asarray(track.leaned(at_s, _UNPROVEN_S) < _STEADY_RAD)
 
 
 def _still(rows: _Rows | None, at_s: FloatArray) -> _Rows | None:
-    """Displacements between moments ``(K,)`` along axes along which the drone is at rest."""
+    """Displacements between times ``(K,)`` along axes at rest."""
     if rows is None:
         return None
     lasted_s = rows.D.sum(2) @ at_s
@@ -356,7 +357,7 @@ def _stacked(parts: list[_Rows]) -> _Rows | None:
 
 
 def _shares(stamp_s: FloatArray, start_s: FloatArray, end_s: FloatArray) -> FloatArray:
-    """Time [s] for which each reading is valid in each interval ``(N, S)``: from half-way to its neighbours."""
+    """Time [s] for which each reading is valid in each interval ``(N, S)``: to the midpoints with its neighbours."""
     middle = 0.5 * (stamp_s[1:] + stamp_s[:-1])
     low, high = np.append(-np.inf, middle), np.append(middle, np.inf)
     overlap = np.minimum(end_s[:, None], high) - np.maximum(start_s[:, None], low)
@@ -368,15 +369,15 @@ def _runs(
 ) -> FloatArray:
     """Errors of displacements per standard deviation of each quantisation error ``(3 N, runs)``.
 
-    A quantisation error is uniform within the step, or within two steps for a zero that may be truncated. While a
-    reading stays the same a part of its error does as well; the rest changes with the speed.
+    A quantisation error is uniform within a step, or within two steps for a zero that may be truncated. While a reading
+    stays constant, part of its error does as well; the rest changes with the speed.
 
     Args:
         share: From `_shares` ``(N, S)``.
         stamp_s: Stamps of the readings ``(S,)``.
         velocity: Readings in the drone's own axes ``(S, 3)``.
         R_w: Those axes to world ``(S, 3, 3)``.
-        step_m_s: The step.
+        step_m_s: Quantisation step.
         truncates: Probability of truncation.
     """
     N = len(share)

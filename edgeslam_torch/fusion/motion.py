@@ -180,7 +180,7 @@ class MotionFusion:
             self._filter.move_map(seen.moved(T))
 
     def begin_piece(self) -> None:
-        """Begin a submap at a predicted pose: the step between the submaps is no motion of the camera."""
+        """Begin a submap at a predicted pose: the step between submaps is no motion of the camera."""
         self._filter.clear()
         self._memory.interrupt()
 
@@ -243,7 +243,7 @@ class MotionFusion:
 
     @property
     def filtering(self) -> bool:
-        """Whether the Kalman filter is fed by vision: it then predicts the camera."""
+        """Whether the Kalman filter receives visual updates and predicts the camera."""
         return self._filter.seen is not None
 
     def predict(self, stamp_s: float) -> PoseEstimate | None:
@@ -341,15 +341,15 @@ class MotionFusion:
         return numbers | self.metres.statistics()
 
     def warnings(self) -> list[str]:
-        """Warnings of depth network or telemetry that the images contradict, and which are not used."""
+        """Warnings of a rejected depth network or rejected telemetry."""
         drift = [] if self._drift is None else [self._drift]
         return self._trust.warnings() + self._track.warnings() + self.metres.warnings() + drift
 
     def telemetry(self) -> TelemetryModel | None:
-        """Present telemetry and its alignment with the map, for refinement; None while there is none.
+        """Present telemetry and its alignment with the map, for refinement; None without any.
 
-        Until the metric scale is known only gravity is used, if the map began upright: `Orientation.R_w_m` is a mean
-        over attitudes and would include the map's own tilt.
+        Before the metric scale is known only gravity is used, and only if the map began upright: `Orientation.R_w_m` is
+        a mean over attitudes and would include the map's own tilt.
         """
         model = self._model()
         return None if model is None else replace(model, track=self._track.copy())

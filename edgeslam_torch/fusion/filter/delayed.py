@@ -15,11 +15,11 @@ from edgeslam_torch.types import FloatArray, TelemetrySample
 _TELEMETRY, _RELATIVE, _ABSOLUTE, _CLONE = range(4)
 _SAME_S = 1e-6
 _SILENCE_S = 0.5
-"""Readings further apart are not interpolated."""
+"""Maximum gap between readings for interpolation."""
 _PACKET_S = 0.15
-"""Time for which a rotation rate is extrapolated after the last reading."""
+"""Maximum time for extrapolating a rotation rate: one packet."""
 _EXACT = 1e-6
-"""Jitter of what has none [m], [rad]: keeps the covariance of an innovation invertible."""
+"""Minimum jitter [m], [rad]: keeps the innovation covariance invertible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class _Event:
     rpy_s: float = math.nan
 
     def inherit(self, previous: "_Event") -> None:
-        """What holds until a reading or a clone says otherwise."""
+        """Copy what stays valid until the next reading or clone."""
         self.clone_s, self.battery, self.rate = previous.clone_s, previous.battery, previous.rate
         self.rpy, self.rpy_s = previous.rpy, previous.rpy_s
 
@@ -72,10 +72,10 @@ class _Event:
 
 
 class BufferedEkf:
-    """`Ekf` with a clock: measurements of the last ``config.buffer_s`` may come in any order.
+    """`Ekf` with a clock: measurements of the last ``config.buffer_s`` may arrive in any order.
 
-    A late one is inserted among the buffered events; the filter is restored to the state before it and later events
-    are applied again. Velocities and angles between two readings are interpolated once both are there.
+    A late measurement is inserted among the buffered events; the filter is restored to the state before it and later
+    events are applied again. Velocities and angles between two readings are interpolated once both have arrived.
     """
 
     def __init__(self, config: FusionConfig) -> None:
@@ -103,7 +103,7 @@ class BufferedEkf:
             self._insert(_Event(sample.stamp_s, _TELEMETRY, sample=sample))
 
     def see(self, stamp_s: float) -> None:
-        """Vision sees the body, where is not known: the start of the increments that follow."""
+        """Start vision at an unmeasured pose: the origin of the increments that follow."""
         if math.isfinite(stamp_s):
             self._insert(_Event(stamp_s, _CLONE))
 
@@ -113,10 +113,10 @@ class BufferedEkf:
         """Visual motion of the body between two stamps.
 
         Args:
-            from_s: Where the increment before ended; a gap starts anew.
+            from_s: End of the previous increment; a gap starts anew.
             to_s: End.
             T_from_to: Pose at ``to_s`` in the body frame at ``from_s`` [m], shape ``(4, 4)``.
-            drift: Error of the increment that adds up from one to the next.
+            drift: Error of the increment, which accumulates.
             jitter: Error of the visual pose at its end, which does not.
         """
         if not math.isfinite(from_s + to_s) or to_s <= from_s:
@@ -156,18 +156,18 @@ class BufferedEkf:
         return moved
 
     def _go_to(self, stamp_s: float) -> _Event | None:
-        """The last event not after a stamp."""
+        """Restore the filter to the last event up to a stamp."""
         index = bisect.bisect_right(self._events, (stamp_s, _CLONE + 1), key=lambda e: e.key)
         return self._events[index - 1] if index > 0 else None
 
     def _advance(self, event: _Event, stamp_s: float) -> FloatArray:
-        """Put the filter to where it was at an event and propagate it; gives the velocity there."""
+        """Restore the filter to an event and propagate it; returns the velocity there."""
         assert event.saved is not None
         self.ekf.restore(event.saved)
         return self._predict(event, stamp_s, bisect.bisect_right(self._events, event.key, key=lambda e: e.key))
 
     def resumed(self) -> "BufferedEkf":
-        """A filter of its own that goes on from the newest event; what it is told does not come back here."""
+        """An independent filter that continues from the newest event."""
         other = BufferedEkf(self.config)
         if self._events:
             other._events.append(replace(self._events[-1]))
@@ -177,7 +177,7 @@ class BufferedEkf:
         return other
 
     def statistics(self) -> dict[str, int]:
-        """How many measurements were accepted, refused, recovered, late."""
+        """Numbers of accepted, refused, recovered and late measurements."""
         counts = Counter(self._done)
         counts.update(e.outcome for e in self._events if e.outcome)
         return dict(counts)
@@ -204,7 +204,7 @@ class BufferedEkf:
         self._forget()
 
     def _start(self, event: _Event) -> None:
-        """The first attitude or pose sets the state; position starts at zero, as the drone's own frame does."""
+        """Initialise from the first attitude or pose; the position is zero, as in the drone's own frame."""
         if event.sample is not None and np.all(np.isfinite(event.sample.rpy_rad)):
             self.ekf.reset_pose(np.zeros(3), event.sample.rpy_rad)
         elif event.kind == _ABSOLUTE and event.T is not None:
@@ -227,7 +227,7 @@ class BufferedEkf:
         event.saved = ekf.copy_state()
 
     def _predict(self, previous: _Event, stamp_s: float, index: int) -> FloatArray:
-        """From the event before ``index`` to ``stamp_s``; velocity and angles are interpolated to the next reading.
+        """Propagate from the event before ``index``; velocity and angles are interpolated to the next reading.
 
         Returns:
             The velocity at ``stamp_s`` ``(3,)``.
@@ -241,7 +241,7 @@ class BufferedEkf:
             return velocity
         end = velocity
         following = self._next_reading(index)
-        # The printed filter holds a reading until the next one.
+        # The printed filter keeps a reading until the next one.
         if following is not None:
             reach = following.stamp_s - previous.stamp_s
             if reach < _SILENCE_S and math.isfinite(float(following.velocity_m_s.sum())):
@@ -283,7 +283,7 @@ class BufferedEkf:
         else:
             ekf.carry_clone(event.T, event.noise.t_m, event.noise.r_rad)
             outcome = ekf.update_clone(max(event.jitter.t_m, _EXACT), max(event.jitter.r_rad, _EXACT))
-            if outcome is Outcome.REFUSED:  # what follows may be right again
+            if outcome is Outcome.REFUSED:  # later events may still be accepted
                 ekf.clone()
         event.outcome = self._named("visual", outcome)
         event.nis = ekf.nis if outcome is not Outcome.NO_CLONE else math.nan
@@ -310,7 +310,7 @@ def _degrees(event: _Event) -> int:
 
 
 def _rate(before: _Event, sample: TelemetrySample) -> FloatArray:
-    """Rates of the angles [rad/s] between the last attitude reading and this one; zero when they are far apart."""
+    """Euler angle rates [rad/s] between the last attitude reading and this one; zero across a gap."""
     dt = sample.stamp_s - before.rpy_s
     if before.rpy is None or not 0.0 < dt < _SILENCE_S or not math.isfinite(float(sample.rpy_rad.sum())):
         return np.zeros(3)

@@ -29,7 +29,7 @@ _CLONE_P, _CLONE_A = slice(9, 12), slice(12, 15)
 _SIZE = 15
 _NO_RATE = np.zeros(3)
 _BLIND_S = 0.5
-"""Time without vision from which no motion is read out of readings of nothing; a late video's gap is shorter."""
+"""Time without vision after which zero readings are taken as hover; longer than a late video's gap."""
 _IDENTITY = np.eye(4)
 
 Saved = tuple[FloatArray, FloatArray, float, dict[int, int]]
@@ -92,13 +92,13 @@ class Ekf:
         self.tau_s = 0.0
         """Time since the last visual update, paper eq. (10)."""
         self.refused_in_row = {3: 0, 6: 0}
-        """Refusals of attitude (3 numbers) and of vision (6) since the last one that was accepted."""
+        """Consecutive refusals of attitude (3 components) and of vision (6)."""
         self.nis = math.nan
         """Normalised innovation squared of the last measurement."""
         self._gate = {n: float(chdtri(n, 1.0 - config.gate_probability)) for n in (3, 6)}
 
     def reset_pose(self, p_w: FloatArray, rpy_rad: FloatArray) -> None:
-        """Start at a known pose with the initial uncertainty."""
+        """Start at a given pose with the initial uncertainty."""
         self.x[_P], self.x[_A] = p_w, rpy_rad
         self.clone()
 
@@ -146,9 +146,10 @@ class Ekf:
         diagonal[_B] += bias
 
     def _bias(self, velocity_m_s: FloatArray) -> FloatArray:
-        """What a reading is off by ``(3,)``; nothing where a drone without vision for a while reads that it stands.
+        """Velocity bias to subtract from a reading ``(3,)``; zero for zero readings after some time without vision.
 
-        The bias of a moving drone is what whole steps cut off its speed, and would carry one that hovers away.
+        The bias estimated in flight is mostly quantisation loss; subtracting it from the readings of a hovering drone
+        would make it drift.
         """
         bias = self.x[_B]
         return bias if self.tau_s < _BLIND_S else np.where(velocity_m_s == 0.0, 0.0, bias)
@@ -186,7 +187,7 @@ class Ekf:
         return outcome
 
     def clone(self) -> None:
-        """Start vision at the filter's pose, without information of its own."""
+        """Clone the filter's pose at the start of vision, without new information."""
         self.x[_CLONE] = self.x[_POSE]
         self.P[_CLONE] = self.P[_POSE]
         self.P[:, _CLONE] = self.P[:, _POSE]
@@ -206,7 +207,7 @@ class Ekf:
         x[_CLONE_P] += moved
         x[_CLONE_A] = rpy_from_matrix(R.dot(T[:3, :3]))
         to_rates = np.linalg.inv(euler_rate_matrix(x[_CLONE_A]))
-        G = np.eye(6)  # of the clone's change by its error before
+        G = np.eye(6)  # derivative of the clone's change by its previous error
         G[:3, 3:] = _cross_columns(E, moved)
         G[3:, 3:] = to_rates.dot(E)
         P[_CLONE] = G.dot(P[_CLONE])
@@ -215,11 +216,11 @@ class Ekf:
         P[_CLONE_A, _CLONE_A] += sigma_r_rad**2 * to_rates.dot(to_rates.T)
 
     def update_clone(self, sigma_t_m: float, sigma_r_rad: float) -> Outcome:
-        """The body is where vision sees it, to within the jitter of one visual pose [m], [rad], per axis."""
+        """Constrain the body to the clone, up to the jitter of one visual pose [m], [rad], per axis."""
         return self.update_relative(_IDENTITY, sigma_t_m, sigma_r_rad)
 
     def update_relative(self, T_clone_b: FloatArray, sigma_t_m: float, sigma_r_rad: float) -> Outcome:
-        """Motion since the clone, measured independently of everything else; the clone stays where it is.
+        """Motion since the clone, measured independently of everything else; the clone is unchanged.
 
         Args:
             T_clone_b: Body pose in the cloned body frame [m], shape ``(4, 4)``.
@@ -233,10 +234,10 @@ class Ekf:
         return outcome
 
     def since_clone(self, velocity_m_s: FloatArray) -> "Relative":
-        """Pose and velocity in the axes of the body where vision last saw it.
+        """Pose and velocity in the body axes of the last visual update.
 
         Args:
-            velocity_m_s: Reading ``(3,)`` that holds now, in ``config.velocity_frame``.
+            velocity_m_s: Current reading ``(3,)``, in ``config.velocity_frame``.
         """
         x, config = self.x, self.config
         seen, H = relative_measurement(x, _IDENTITY)
@@ -273,8 +274,8 @@ class Ekf:
             if self.refused_in_row[n] < self.config.refusals_before_recovery:
                 return Outcome.REFUSED
             outcome = Outcome.RECOVERED
-            # The filter was overconfident: inflate what the measurement tells of, according to the innovation. All of
-            # the covariance would grow for ever with it, as nothing measures the absolute place.
+            # The filter was overconfident: inflate the observed subspace according to the innovation. Inflating all of
+            # the covariance would let it grow without bound, as the absolute position is unobservable.
             grown = min(self.nis / n, 1e4) - 1.0
             known = S.copy()
             known.ravel()[:: n + 1] -= noise
@@ -290,7 +291,7 @@ class Ekf:
         self.P = 0.5 * (P + P.T)
         if not self.config.literal:
             _wrap_in_place(self.x, (3, 4, 5, 12, 13, 14))
-            # Whole steps hide less than a step. A wrong map moves faster: where it is lost, its speed must not stay.
+            # Quantisation loss is below one step. A larger bias comes from a wrong map and must not persist after it.
             np.clip(self.x[_B], -self.config.velocity_step_m_s, self.config.velocity_step_m_s, out=self.x[_B])
         return outcome
 
@@ -304,7 +305,7 @@ class Ekf:
         return self.x.copy(), self.P.copy(), self.tau_s, dict(self.refused_in_row)
 
     def restore(self, saved: Saved) -> None:
-        """Go back to what `copy_state` returned."""
+        """Restore what `copy_state` returned."""
         self.x, self.P = np.array(saved[0]), np.array(saved[1])
         self.tau_s, self.refused_in_row = saved[2], dict(saved[3])
 
@@ -318,7 +319,7 @@ def _solved(S: FloatArray, P_Ht: FloatArray, residual: FloatArray) -> tuple[Floa
     columns[:, :_SIZE] = P_Ht.T
     columns[:, _SIZE] = residual
     _, solution, info = dposv(S, columns, overwrite_b=True)
-    if info != 0:  # not positive definite: only rounding can do that to a covariance
+    if info != 0:  # not positive definite, from rounding errors only
         solution = np.linalg.lstsq(S, columns, rcond=None)[0]
     return solution[:, :_SIZE], solution[:, _SIZE]
 
@@ -337,6 +338,6 @@ def _pose_noise(sigma_t_m: float, sigma_r_rad: float) -> FloatArray:
 
 
 def _cross_columns(E: FloatArray, v: FloatArray) -> FloatArray:
-    """Columns ``E[:, k] x v``: how ``v`` turns with each Euler angle, shape ``(3, 3)``."""
+    """Columns ``E[:, k] x v``: derivative of the rotated ``v`` by each Euler angle, shape ``(3, 3)``."""
     x, y, z = float(v[0]), float(v[1]), float(v[2])
     return np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]) @ E

@@ -1,7 +1,7 @@
 """Feeds tracked poses to the Kalman filter as metric increments, and expresses its predictions in the map.
 
-The filter does not estimate the pose of the map in the drone's world, only the motion of the body since the last visual
-pose. A prediction in the map needs no more, and stays valid when the map is moved, rotated or scaled.
+The filter estimates only the motion of the body since the last visual pose, not the pose of the map in the drone's
+world. This suffices for predictions in the map, and stays valid when the map is moved, rotated or scaled.
 """
 
 import math
@@ -62,7 +62,7 @@ class FilterView:
 
 
 class FilterFeed:
-    """Keeps the pose at the filter's last visual update."""
+    """Converts visual poses to filter updates, relative to the pose at the last update."""
 
     def __init__(self, config: FusionConfig, T_b_c: FloatArray) -> None:
         self._config, self._T_b_c = config, T_b_c
@@ -83,11 +83,11 @@ class FilterFeed:
         self._seen = seen
 
     def clear(self) -> None:
-        """Forget the last pose: a new map has another gauge."""
+        """Reset the last pose: a new map has another gauge."""
         self._seen = self._delay = self._accumulated = None
 
     def add_telemetry(self, sample: TelemetrySample, shortfall_m_s: float) -> None:
-        """One state message; its velocity reads low by ``shortfall_m_s`` unless it is zero."""
+        """Add one state message; non-zero velocities are corrected by a truncation loss of ``shortfall_m_s``."""
         self.ekf.add_telemetry(_corrected(sample, shortfall_m_s))
 
     def see(self, visual: VisualPose, metric: Metric) -> None:
@@ -154,11 +154,11 @@ class FrozenFilter:
     max_gap_s: float
 
     def view(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> FilterView | None:
-        """Where the camera is at a moment of telemetry's clock, or at the filter's own if that is later.
+        """The camera on telemetry's clock, at ``stamp_s`` or at the filter's newest event if that is later.
 
         Args:
-            stamp_s: When.
-            telemetry: What has arrived since.
+            stamp_s: Requested time.
+            telemetry: State messages since the copy.
         """
         ekf = self.ekf.resumed()
         for sample in telemetry:
@@ -191,7 +191,7 @@ def view(
 
 
 def _corrected(sample: TelemetrySample, shortfall_m_s: float) -> TelemetrySample:
-    """A truncated velocity, corrected by what truncation takes away on average."""
+    """Correct a truncated velocity by the mean truncation loss."""
     if shortfall_m_s == 0.0:
         return sample
     return replace(sample, velocity_m_s=sample.velocity_m_s + shortfall_m_s * np.sign(sample.velocity_m_s))

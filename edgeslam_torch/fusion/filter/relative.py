@@ -2,8 +2,8 @@ r"""The relative visual measurement of two poses in the filter's state, in scala
 
 .. math:: T_{clone,b} = T_c^{-1} T, \quad h_t = R_c^T (p - p_c), \quad h_R = R_c^T R
 
-Euler rates act in body axes through :math:`W = R^T E` (ZYX), which has a closed form, so no matrix is multiplied that
-is known beforehand: a numpy call on nine numbers costs as much as forty multiplications here.
+Euler rates act in body axes through :math:`W = R^T E` (ZYX), which has a closed form. Scalar code avoids the overhead
+of numpy calls, each of which costs as much as forty multiplications.
 """
 
 import math
