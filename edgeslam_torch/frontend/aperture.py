@@ -1,9 +1,9 @@
-"""Which keypoints are corners: the others slid along an edge (aperture problem), by the structure tensor around them.
+"""Selection of keypoints that are corners by the structure tensor; the others slide along an edge (aperture problem).
 
-Least squares on grey levels places a patch with covariance ``s^2 S^-1``, ``S`` being the sum of ``grad grad^T`` over it
-(Förstner and Gülch, 1987). FAST finds keypoints on bare walls too, where the joint of two panels is all there is: they
-match, .15 px off across the joint and 2 to 10 px along it. Hundreds of such matches fit an essential matrix of
-a wrong motion, with a sharp minimum.
+Least squares on grey levels locates a patch with covariance ``s^2 S^-1``, where ``S`` is the sum of ``grad grad^T``
+over it (Förstner and Gülch, 1987). FAST also finds keypoints on plain edges, such as the joint of two wall panels:
+their matches have errors of 0.15 px across the edge and 2 to 10 px along it. Hundreds of such matches fit an essential
+matrix of a wrong motion, with a sharp minimum.
 """
 
 import cv2
@@ -15,17 +15,17 @@ from edgeslam_torch.types import FloatArray
 RADIUS_PX = 4.0
 """Half the side of the square at pyramid level 0: a FAST circle and the support of its gradients."""
 MIN_WEAK_ROOT = 15.0
-"""Minimum root of the tensor's smaller eigenvalue [grey levels]: with 15 grey levels between corresponding pixels
-(noise, light, perspective) a patch is placed to a pixel along its edge. Along it, matches of known motion are 1.0 to
-2.2 px off below 12 (median, four recordings), .4 to 1.1 px above 25, and in between as the recording is."""
+"""Minimum root of the tensor's smaller eigenvalue [grey levels]: with a difference of 15 grey levels between
+corresponding pixels (noise, light, perspective), a patch is located to a pixel along its edge. The median error along
+the edge is measured as 1.0 to 2.2 px below 12 and 0.4 to 1.1 px above 25."""
 
 MIN_ROOT_RATIO = 0.1
-"""Minimum root of the ratio of the eigenvalues: the pixel grid alone turns the gradients of a straight, sharp edge by
-up to 5 degrees."""
+"""Minimum root of the ratio of the eigenvalues: aliasing alone rotates the gradients of a straight, sharp edge by up to
+5 degrees."""
 
 
 def are_corners(grey: np.ndarray, uv: FloatArray, scale: FloatArray) -> NDArray[np.bool_]:
-    """Which keypoints ``(N,)`` have a certain position along every direction.
+    """Mask ``(N,)`` of keypoints that are well localised in every direction.
 
     Args:
         grey: Image ``(H, W)`` uint8.
@@ -49,7 +49,7 @@ def are_corners(grey: np.ndarray, uv: FloatArray, scale: FloatArray) -> NDArray[
 
 
 def _tensor(grey: np.ndarray, uv: FloatArray, radius: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sums of the products of the gradient [grey levels a pixel] over squares around pixels, ``(N,)`` each."""
+    """Sums of products of the gradient [grey levels per pixel] over squares around pixels, ``(N,)`` each."""
     height, width = grey.shape
     u, v = np.rint(uv).astype(np.int64).T
     r = np.rint(radius).astype(np.int64)

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 WELL_EXPOSED = 128.0
-"""Grey level that a twentieth of a well exposed picture exceeds: half of the range. Automatic exposure gets there (134
-to 255 in the recordings and the lit simulations); where it ends, in the dark, 30 to 50 are left."""
+"""95 % quantile of a well exposed image [grey levels]: half of the range. Automatic exposure reaches 134 to 255 in
+normal light, and only 30 to 50 in the dark."""
 NOISE_GRADIENTS = 8.0
 """Noise of one grey level has a gradient (smoothed, 3x3 Sobel) of 1.3 on each axis and above 5.7 in one pixel of ten
 thousand."""
 _EVERY = 8
-"""A pixel in eight of each axis tells the exposure."""
+"""Subsampling along each axis for the exposure."""
 _NOISE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
-"""Zero on planes and straight edges; of unit noise it makes a standard deviation of 6 (Immerkaer 1996)."""
+"""Zero on planes and straight edges; its response to unit noise has a standard deviation of 6 (Immerkaer 1996)."""
 
 
 def canny(grey: NDArray[np.uint8], low: float, high: float) -> NDArray[np.bool_]:
@@ -33,7 +33,7 @@ def canny(grey: NDArray[np.uint8], low: float, high: float) -> NDArray[np.bool_]
 
 
 def gradient(grey: NDArray[np.uint8]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """3x3 Sobel gradient of the smoothed image along x and y, ``(H, W)`` each: as `canny` uses it."""
+    """3x3 Sobel gradient of the smoothed image along x and y, ``(H, W)`` each, as in `canny`."""
     gx, gy = cv2.spatialGradient(cv2.GaussianBlur(grey, (5, 5), 1.0), ksize=3, borderType=cv2.BORDER_REPLICATE)
     return gx.astype(np.int16, copy=False), gy.astype(np.int16, copy=False)
 
@@ -44,9 +44,9 @@ def canny_of_gradient(gx: NDArray[np.int16], gy: NDArray[np.int16], low: float, 
 
 
 def edge_thresholds(grey: NDArray[np.uint8], low: float, high: float) -> tuple[float, float]:
-    """Canny's thresholds for a picture ``(H, W)``: as given where it is well exposed, less in the dark.
+    """Canny's thresholds for an image ``(H, W)``: as given for a well exposed image, lower for a dark one.
 
-    Gradients of a dark room are as much smaller as its pictures are darker; those of noise are not.
+    Gradients of the scene are proportional to the exposure, those of noise are not.
 
     Example:
         >>> import numpy as np

@@ -13,9 +13,9 @@ class Junctions:
     """L-junctions of one image; ``C`` of them, longest arms first."""
 
     uv: FloatArray
-    """``(C, 2)`` corner, where the two fitted lines meet [px], float64."""
+    """``(C, 2)`` corner, the intersection of the two fitted lines [px], float64."""
     arms: FloatArray
-    """``(C, 2, 2)`` unit directions away from the corner, clockwise as seen (u right, v down)."""
+    """``(C, 2, 2)`` unit directions away from the corner, clockwise in the image (u right, v down)."""
     length_px: FloatArray
     """``(C, 2)`` straight length of each arm [px]."""
     angle_rad: FloatArray
@@ -120,13 +120,13 @@ def _straight_runs(edges: np.ndarray, config: JunctionConfig) -> tuple[np.ndarra
 
 
 def _turning_points(contour: np.ndarray, bend_px: float) -> np.ndarray:
-    """Places in a closed contour where its polygon has corners, ascending."""
+    """Indices of the polygon's corners in a closed contour, ascending."""
     corners = cv2.approxPolyDP(contour, bend_px, True)[:, 0].astype(np.int64)
     code = contour[:, 0, 0].astype(np.int64) * 65536 + contour[:, 0, 1]
     order = np.argsort(code, kind="stable")
     wanted = corners[:, 0] * 65536 + corners[:, 1]
     # A thin line is traced in both directions, so a pixel may occur twice in its contour: take the occurrence that
-    # keeps the order.
+    # preserves the order.
     lo, hi = np.searchsorted(code[order], wanted), np.searchsorted(code[order], wanted, side="right")
     places, last = [], -1
     shift = int(order[lo[0]])
@@ -163,7 +163,7 @@ def _sample(image: np.ndarray, uv: FloatArray) -> FloatArray:
 
 
 def _fit_lines(points: FloatArray, runs: np.ndarray, config: JunctionConfig) -> _Lines:
-    """Total least squares line of each run, its ends left out."""
+    """Total least squares line of each run, without its ends."""
     first, end = runs[:, 0] + config.trim_px, runs[:, 1] - config.trim_px + 1
     long = end - first >= max(6, int(config.min_arm_px) - 2 * config.trim_px)
     first, end = np.where(long, first, 0), np.where(long, end, 2)

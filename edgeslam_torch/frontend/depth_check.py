@@ -19,16 +19,16 @@ PLAUSIBLE_M = (0.05, 200.0)
 """Cheap fixed-focus lenses are out of focus below 5 cm. The network's range ends at 100 m for its training focal
 length, at 200 m for one twice as long; values beyond are overflows."""
 MAX_SIGMA_LOG = 5.0
-"""log(150): a depth that uncertain is unknown."""
+"""Maximum standard deviation of log depth, log(150); above, the depth is unknown."""
 MIN_SHARE = 0.5
-"""Minimum share of plausible pixels. Sky and windows cover part of an image; a network that fails on most of it
-cannot be trusted on the rest."""
+"""Minimum share of plausible pixels. Sky and windows cover part of an image; a network that fails on most of it is
+unreliable on the rest."""
 
 ORDER_MAPS, ORDER_SIDE = 5, 48
-"""Maps whose order is compared with that of another network, at about so many pixels a side."""
+"""Number of maps whose depth order is compared with another network's, and the side of the compared maps [px]."""
 CONTRADICTION = -0.3
-"""Rank correlation below which two networks contradict each other about what is nearer. Those of one scene have 0.5
-and more; exchanged, as much below zero."""
+"""Rank correlation below which two networks contradict each other. Maps of one scene reach at least 0.5, and at most
+-0.5 if near and far are exchanged."""
 
 
 def usable(depth: DepthMap) -> NDArray[np.bool_]:
@@ -41,7 +41,7 @@ def usable(depth: DepthMap) -> NDArray[np.bool_]:
 
 
 def order_agreement(depth: DepthMap, reference: DepthMap) -> float:
-    """Rank correlation of two depth maps of one image, -1 to 1; NaN where too little is known."""
+    """Rank correlation of two depth maps of one image, -1 to 1; NaN with too few common pixels."""
     steps = tuple(slice(None, None, max(1, side // ORDER_SIDE)) for side in depth.depth_m.shape)
     known = usable(depth)[steps] & usable(reference)[steps]
     if np.count_nonzero(known) < ORDER_SIDE:
@@ -54,8 +54,8 @@ class CheckedDepth:
     """Wraps a depth function and discards implausible pixels and maps.
 
     A function with an attribute ``reference``, another depth function, is compared with it in its first `ORDER_MAPS`
-    maps: one that takes for far what the other takes for near is not used. Its ``said_instead`` says how it should have
-    been read. A map started from depth that is inside out stays so, and agrees with it.
+    maps and rejected if near and far are exchanged; its ``said_instead`` returns the likely interpretation of its
+    output. The map cannot detect this, as it is initialised from the same depth.
 
     Args:
         depth: Function to check.
@@ -71,7 +71,7 @@ class CheckedDepth:
         self._contradiction: str | None = None
 
     def __call__(self, image: np.ndarray, camera: Camera) -> DepthMap | None:
-        """The depth map with NaN where it is not usable; None if too few pixels are."""
+        """The depth map with NaN at unusable pixels; None if too few are usable."""
         depth = self.depth(image, camera)
         self.maps += 1
         if depth is None:
@@ -86,7 +86,7 @@ class CheckedDepth:
         return depth if share == 1.0 else replace(depth, depth_m=np.where(good, depth.depth_m, np.float32(np.nan)))
 
     def _contradicted(self, depth: DepthMap, image: np.ndarray, camera: Camera) -> bool:
-        """Whether the maps so far show near and far exchanged."""
+        """Whether the maps so far have near and far exchanged."""
         if len(self._agreement) < ORDER_MAPS and (reference := getattr(self.depth, "reference", None)) is not None:
             other = reference(image, camera)
             found = order_agreement(depth, other)

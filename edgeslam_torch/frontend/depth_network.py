@@ -37,21 +37,21 @@ logger = logging.getLogger(__name__)
 _TRIAL_SIZE = 64
 """Side of the test images for newly loaded weights [px]; takes a few milliseconds."""
 _LOG_RANGE = MAX_LOG_DEPTH - 1e-3
-"""The network clips log depth to this range: values at its ends mean out of range."""
+"""The network clips log depth to this range: values at its limits are out of range."""
 
 
 class DepthNetwork(Protocol):
-    """Depth of an undistorted image: what the SLAM takes, whatever network is behind it."""
+    """Depth of an undistorted image: the interface of every depth network."""
 
     weights: Path
 
     @property
     def is_metric(self) -> bool:
-        """Whether its depth is in metres; otherwise its inverse is right up to scale and shift."""
+        """Whether its depth is in metres; otherwise its inverse is defined up to scale and shift."""
 
     @property
     def backend(self) -> str:
-        """What runs it."""
+        """Name of its runtime."""
 
     def __call__(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
         """Depth and its uncertainty at the size of the image, ``(H, W, 3)`` BGR or ``(H, W)`` grey."""
@@ -60,13 +60,13 @@ class DepthNetwork(Protocol):
 def open_depth(
     weights: Path | None = None, backend: str = "onnxruntime", threads: int = 1, device: str = "cpu"
 ) -> DepthNetwork:
-    """A depth network from a file: FastDepth, or an ONNX network of others that is described.
+    """A depth network from a file: FastDepth, or a third-party ONNX network with a description.
 
     Args:
         weights: A ``.safetensors`` file or an ``.onnx`` file; the shipped weights by default.
         backend: ``"onnxruntime"`` or ``"torch"``; an ONNX file runs in onnxruntime.
         threads: Threads per inference.
-        device: ``cpu``, ``cuda``, ``mps``, or ``auto``: the fastest that is there.
+        device: ``cpu``, ``cuda``, ``mps``, or ``auto``: the fastest available.
 
     Raises:
         ConfigError: If there is no such device.
@@ -80,7 +80,7 @@ def open_depth(
 
 
 def trial(path: str) -> int:
-    """What `try_apart` runs in a process of its own; exit code 0 if the network can be used."""
+    """Entry point of the subprocess of `try_apart`; exit code 0 if the network is usable."""
     bound_memory(Path(path))
     try:
         _open_onnx(Path(path)).try_larger()
@@ -130,7 +130,7 @@ class _Engine(Protocol):
     metadata: Metadata
     fixed_size: tuple[int, int] | None
     device: str
-    """Where it runs, for people."""
+    """Device, as shown to the user."""
 
     def run(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """``(1, 3, H, W)`` -> log depth and sigma, both ``(H/2, W/2)``."""
@@ -144,8 +144,8 @@ class DepthPredictor:
         weights: A ``.safetensors`` file or an exported ``.onnx`` file; the shipped weights by default.
         backend: ``"onnxruntime"`` (falls back to torch when it is not installed) or ``"torch"``.
         threads: Threads per inference. With torch this sets the number of threads of the process.
-        device: ``cpu``, ``cuda``, ``mps``, or ``auto``: the fastest that is there. On a GPU weights run in onnxruntime
-            if it has CUDA, else in torch.
+        device: ``cpu``, ``cuda``, ``mps``, or ``auto``: the fastest available. On a GPU weights run in onnxruntime
+            if it supports CUDA, else in torch.
 
     Raises:
         ConfigError: If there is no such device.
@@ -173,7 +173,7 @@ class DepthPredictor:
         _try_out(self._engine, self.weights)
 
     def try_larger(self) -> None:
-        """Run it on an image of the training size, where memory that grows faster than the image shows."""
+        """Run it on an image of the training size, to detect memory that grows faster than the image."""
         height, width = self._engine.fixed_size or _training_size(self.metadata)
         self._engine.run(np.zeros((1, 3, height, width), np.float32))
 
@@ -186,15 +186,15 @@ class DepthPredictor:
 
     @property
     def backend(self) -> str:
-        """Backend in use, and its device unless that is the processor."""
+        """Backend in use, and its device unless that is the CPU."""
         runtime = "torch" if isinstance(self._engine, _TorchEngine) else "onnxruntime"
         return words_of(runtime, self._engine.device)
 
     def __call__(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
-        """Depth [m] and its uncertainty at the image's size; NaN where the network's range ends (100 m, 1 cm).
+        """Depth [m] and its uncertainty at the image's size; NaN outside the network's range (1 cm to 100 m).
 
-        The network predicts metres for its training focal length. The same image through a lens twice as long shows a
-        scene twice as far away, so depth is multiplied by the ratio of focal lengths in network pixels.
+        The network predicts metres for its training focal length. The same image at twice the focal length shows a
+        scene at twice the distance, so depth is multiplied by the ratio of focal lengths in network pixels.
 
         Args:
             image: ``(H, W, 3)`` BGR or ``(H, W)`` grey, undistorted.

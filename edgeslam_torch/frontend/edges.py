@@ -13,7 +13,7 @@ def extract_edges(image: np.ndarray, low: float, high: float, most: int, border_
 
     Args:
         image: Undistorted image.
-        low: Lower hysteresis threshold of a well exposed picture, grey levels.
+        low: Lower hysteresis threshold of a well exposed image [grey levels].
         high: Upper hysteresis threshold.
         most: Maximum number of edge pixels; thinned evenly along the edges.
         border_px: Margin without edges, where gradients and warped patches leave the image.
@@ -28,7 +28,7 @@ def extract_edges(image: np.ndarray, low: float, high: float, most: int, border_
     if len(u) > most:
         # Every n-th pixel of a diagonal sweep: neighbours on an edge differ in u + v, so edges thin evenly.
         key = (u + v) % max(2, int(np.ceil(len(u) / most))) * 2 + (u % 2)
-        order = np.argsort(key.astype(np.uint16), kind="stable")[:most]  # which sorts 16 bits by counting
+        order = np.argsort(key.astype(np.uint16), kind="stable")[:most]  # radix sort for 16-bit keys
         order.sort()
         u, v = u[order], v[order]
     gx, gy = along_x[v, u].astype(np.float32), along_y[v, u].astype(np.float32)

@@ -1,4 +1,4 @@
-"""Stage 1, depth: networks of others as ONNX files, in metres for the given camera or relative."""
+"""Stage 1, depth: third-party networks as ONNX files, metric for the given camera or relative."""
 
 import logging
 import time
@@ -25,34 +25,34 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 FARTHEST = 2.0
-"""The far end of what a relative network sees, relative to the median depth, before the map says it. Measured depth has
-its 98th percentile at 1.4 to 2.7 (medians of eight recordings; 1.2 to 3.2 in nine of ten of most ones' images)."""
+"""Assumed largest depth of a relative network, relative to the median depth, until the map determines it. The 98th
+percentile of measured indoor depth is 1.4 to 2.7."""
 FARTHEST_PERCENTILE = 2.0
 BEYOND = 4.0
-"""Factor on `FARTHEST` beyond which relative depth is unknown."""
+"""Factor on `FARTHEST` above which relative depth is unknown."""
 NUMBERS = {
     "tensor(float)": np.float32,
     "tensor(float16)": np.float16,
     "tensor(double)": np.float64,
     "tensor(uint8)": np.uint8,
 }
-"""What a network may take, in onnxruntime's words."""
+"""Input types of a network by onnxruntime's names."""
 SLOW_S = 1.0
-"""Time of one image beyond which a smaller input is suggested."""
+"""Time per image above which a smaller input is suggested."""
 SAME_UNIT = 1.5
-"""Median ratio of depths, as a logarithm (a factor of 4.5), within which two networks speak of the same unit."""
+"""Maximum median log ratio of depths (a factor of 4.5) of two networks with the same unit."""
 _TRIAL_SIDE = 112
 """Side of the test images [px], rounded up: eight patches of a vision transformer."""
 
 
 class ExternalDepth:
-    """Depth of an undistorted image by an ONNX network that is described (`models.onnx.external`).
+    """Depth of an undistorted image by an ONNX network with a description (`models.onnx.external`).
 
     Args:
         weights: The ``.onnx`` file.
         threads: Threads per inference.
-        device: ``cpu``, ``cuda``, or ``auto``: CUDA where onnxruntime has it.
-        open_reference: Opens another network, which tells whether near and far are exchanged (`CheckedDepth`).
+        device: ``cpu``, ``cuda``, or ``auto``: CUDA if onnxruntime supports it.
+        open_reference: Opens another network, to detect exchanged near and far (`CheckedDepth`).
 
     Raises:
         ConfigError: If there is no such device.
@@ -96,10 +96,10 @@ class ExternalDepth:
         return not self.network.is_relative
 
     def __call__(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
-        """Depth and its uncertainty at the image's size; NaN where the network gives none.
+        """Depth and its uncertainty at the image's size; NaN where the network predicts none.
 
-        Metres are corrected by the ratio of the focal lengths where the network was trained for one. Relative depth has
-        a median of 1, and `FARTHEST` as its far end: its inverse is right up to scale and shift.
+        Metric depth is multiplied by the ratio of focal lengths if the network was trained for one. Relative depth is
+        normalised to a median of 1 and a maximum of `FARTHEST`: its inverse is defined up to scale and shift.
 
         Args:
             image: ``(H, W, 3)`` BGR or ``(H, W)`` grey, undistorted.
@@ -122,7 +122,7 @@ class ExternalDepth:
         return self._taken(*network_size(camera.height, camera.width, training, self.network.multiple))
 
     def _given(self, image: NDArray[np.uint8], camera: Camera) -> tuple[FloatArray, FloatArray]:
-        """The network's numbers as they are, and their sigma, at the image's size ``(H, W)``."""
+        """The network's raw output and its sigma, at the image's size ``(H, W)``."""
         check_image(image, camera)
         height, width = self._input_size(camera)
         start_s = time.perf_counter()
@@ -142,11 +142,11 @@ class ExternalDepth:
 
     @cached_property
     def reference(self) -> DepthFunction | None:
-        """Depth by the other network; None without one."""
+        """The reference depth network; None without one."""
         return None if self._open_reference is None else self._open_reference()
 
     def said_instead(self, image: NDArray[np.uint8], camera: Camera, reference: DepthMap) -> str:
-        """Which ``gives`` fits the network's numbers for an image better, given another's depth of it."""
+        """The value of ``gives`` that fits the network's output for an image better, given a reference depth map."""
         given = self._given(image, camera)[0]
         known = np.isfinite(given) & np.isfinite(reference.depth_m)
         z = reference.depth_m[known]
@@ -155,21 +155,21 @@ class ExternalDepth:
                 gives: float(np.nanmedian(np.abs(np.log(_metres(given, gives)[known] / z))))
                 for gives in (Gives.METRES, Gives.LOG_METRES, Gives.INVERSE_METRES)
             }
-        if self.network.gives in (Gives.METRES, Gives.LOG_METRES):  # they fell where the other's depth rises
+        if self.network.gives in (Gives.METRES, Gives.LOG_METRES):  # output falls where the reference rises
             fits = Gives.INVERSE_METRES if apart[Gives.INVERSE_METRES] < SAME_UNIT else Gives.RELATIVE_INVERSE
         else:
             fits = Gives.LOG_METRES if apart[Gives.LOG_METRES] < apart[Gives.METRES] else Gives.METRES
         return f"{self.weights.name} is described as {self.network.gives}, its numbers look like gives = '{fits}'"
 
     def _taken(self, height: int, width: int) -> tuple[int, int]:
-        """The size, with the sides that the graph fixes."""
+        """The input size, with the sides that the graph fixes."""
         return self._fixed[0] or height, self._fixed[1] or width
 
     def _run(self, image: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-        """What the network gives and its sigma, ``(h, w)`` each.
+        """The network's output and its sigma, ``(h, w)`` each.
 
         Raises:
-            WeightsError: If the network does not take an image of this size, or gives no plane of numbers.
+            WeightsError: If the network does not accept an image of this size, or its output is no single plane.
         """
         names = [name for name in (self.network.depth, self.network.sigma) if name]
         try:
@@ -181,7 +181,7 @@ class ExternalDepth:
         return planes[0], planes[1] if self.network.sigma else None
 
     def _as_taken(self, image: FloatArray) -> NDArray[np.generic]:
-        """The input ``(1, 3, H, W)`` in the layout and the numbers of the graph."""
+        """The input ``(1, 3, H, W)`` in the layout and the data type of the graph."""
         if self._channels_last:
             image = np.ascontiguousarray(image.transpose(0, 2, 3, 1))
         if self._numbers is np.uint8:
@@ -189,7 +189,7 @@ class ExternalDepth:
         return image.astype(self._numbers, copy=False)
 
     def try_larger(self) -> None:
-        """Run it on images of twice the side, where memory that grows with the square of the pixels shows."""
+        """Run it on images of twice the side, to detect memory that grows with the square of the pixels."""
         height, width = self._trial_size(2 * _TRIAL_SIDE)
         self._run(np.zeros((1, 3, height, width), np.float32))
 
@@ -234,13 +234,13 @@ def _metres(given: FloatArray, gives: str) -> FloatArray:
 
 
 def relative_depth(inverse: FloatArray) -> FloatArray:
-    """Depth whose inverse is a multiple of the given one plus a constant: its median is 1 and its far end `FARTHEST`.
+    """Depth whose inverse is an affine function of the given one, with a median of 1 and a maximum of `FARTHEST`.
 
     Args:
         inverse: ``(H, W)`` inverse depth up to scale and shift.
 
     Returns:
-        ``(H, W)`` float32; NaN where it is unknown, everywhere when the image shows no differences.
+        ``(H, W)`` float32; NaN where unknown, everywhere if the input is constant.
 
     Example:
         >>> relative_depth(np.array([[1.0, 2.0, 3.0]], np.float32)).round(1)

@@ -1,4 +1,4 @@
-"""Radius search over keypoints: a grid of cells, since keypoints are spread evenly and radii are small.
+"""Radius search over keypoints in a grid of cells, since keypoints are spread evenly and radii are small.
 
 A search takes a third of a k-d tree's time because every query has its own radius: a tree's pair search uses one
 radius for all, which a single anchor of the coarsest pyramid level makes three times too wide.

@@ -1,7 +1,7 @@
 """Hamming matching of ORB descriptors, guided by predicted pixels or between whole frames.
 
 Candidates come from a grid over keypoint positions, the distance from the descriptors' bits; a KD-tree over the
-descriptors, as the paper has it, is slower and finds less (docs/decisions/11-no-kd-tree.md).
+descriptors, as in the paper, is slower and has a lower recall (docs/decisions/11-no-kd-tree.md).
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The input of a depth network: an image of a size that suits it, normalised."""
+"""The input of a depth network: a resized, normalised image."""
 
 from typing import Protocol
 
@@ -24,20 +24,20 @@ class Normalisation(Protocol):
 
 
 def check_image(image: NDArray[np.uint8], camera: Camera) -> None:
-    """Refuse an image that is not the camera's.
+    """Reject an image that does not match the camera.
 
     Raises:
-        ValueError: If its size is another or it has neither one nor three channels.
+        ValueError: If its size differs or it has neither one nor three channels.
     """
     if image.shape[:2] != (camera.height, camera.width) or image.ndim not in (2, 3):
         raise ValueError(f"image {image.shape} does not fit a camera of {camera.width}x{camera.height}")
 
 
 def preprocess(image: NDArray[np.uint8], height: int, width: int, values: Normalisation) -> FloatArray:
-    """BGR or grey uint8 -> ``(1, 3, height, width)`` float32, the whole image squeezed, normalised RGB."""
+    """BGR or grey uint8 -> ``(1, 3, height, width)`` float32 normalised RGB, resized without cropping."""
     shrinks = height <= image.shape[0] and width <= image.shape[1]
     if shrinks:
-        # In floats: rounded to grey levels, a mean that lies between two falls one way on x86 and the other on Arm.
+        # In floats: the rounding of half grey levels differs between x86 and Arm.
         small = cv2.resize(image.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
     else:
         small = cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR)

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 TIMEOUT_S = 120.0
 MEMORY_BYTES = 3 << 30
-"""Address space of the process, of which interpreter and libraries take 1.1 GB; and `PER_BYTE` for each of the file."""
+"""Limit of the address space without `PER_BYTE` per byte of the file; interpreter and libraries take 1.1 GB."""
 PER_BYTE = 6
-"""The file, the parsed file, the session's weights, and what they are packed to."""
+"""Memory per byte of the file: the file, the parsed file, the session's weights, and their packed copies."""
 EXIT_REFUSED = 3
 _TRIAL = "import sys; from edgeslam_torch.frontend.depth_network import trial; sys.exit(trial(sys.argv[1]))"
 MAX_REASON = 2000
-"""Characters of an error's words; names in a file may be as long as the file."""
+"""Maximum number of characters of an error message; names in a file may be as long as the file."""
 
 
 def has_onnxruntime() -> bool:
@@ -36,12 +36,12 @@ def open_session(content: bytes, weights: Path, threads: int, device: str = "cpu
 
     Args:
         content: The ONNX file.
-        weights: Where it comes from, for messages.
-        threads: Threads of one inference.
-        device: One of `edgeslam_torch.models.device.DEVICES`; ``auto`` takes CUDA where it works.
+        weights: Its path, for messages.
+        threads: Threads per inference.
+        device: One of `edgeslam_torch.models.device.DEVICES`; ``auto`` selects CUDA if it works.
 
     Raises:
-        ConfigError: If the device is asked for by name, and is not there.
+        ConfigError: If an explicitly named device is not available.
         WeightsError: If onnxruntime is missing or cannot load it.
     """
     try:
@@ -50,13 +50,13 @@ def open_session(content: bytes, weights: Path, threads: int, device: str = "cpu
         raise WeightsError(f"{weights}: running an ONNX file needs onnxruntime (pip install onnxruntime)") from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.log_severity_level = 4  # errors are raised anyway
+    options.log_severity_level = 4  # errors are raised as exceptions
     wanted = onnx_providers(device)
     try:
         session = onnxruntime.InferenceSession(content, options, providers=wanted)
     except Exception as error:  # onnxruntime's errors have no common base class
         raise WeightsError(f"{weights}: onnxruntime cannot load it ({first_line(error)})") from error
-    # It goes on with the next provider, silently, where libraries or the card are missing.
+    # onnxruntime silently falls back to the next provider if libraries or the GPU are missing.
     if session.get_providers()[0] != wanted[0]:
         if device == "cuda":
             raise ConfigError("--device cuda: onnxruntime cannot use CUDA here (driver or libraries); use --device cpu")
@@ -65,11 +65,11 @@ def open_session(content: bytes, weights: Path, threads: int, device: str = "cpu
 
 
 def try_apart(path: Path) -> None:
-    """Open a network and run it on small images in a process of its own, within bounds: a few bytes may ask for
-    gigabytes, or for ever.
+    """Open a network and run it on small images in a subprocess with limits on time and memory, since a small file may
+    request gigabytes or an endless loop.
 
     Raises:
-        WeightsError: If that fails, takes too long or too much memory; as `open_depth` would say where it says so.
+        WeightsError: If it fails or exceeds the limits; with the message of `open_depth` if there is one.
     """
     command = [sys.executable, "-c", _TRIAL, str(path)]
     try:
@@ -85,7 +85,7 @@ def try_apart(path: Path) -> None:
 
 
 def bound_memory(path: Path) -> None:
-    """Bound this process's memory to what a network in a file may need, where the system can."""
+    """Limit this process's memory to the maximum for a network file, where the system supports it."""
     try:
         import resource
     except ImportError:  # Windows
@@ -94,7 +94,7 @@ def bound_memory(path: Path) -> None:
     try:
         resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    except (OSError, ValueError):  # a lower bound is set, or the system knows none
+    except (OSError, ValueError):  # a lower limit is set, or the system supports none
         return
 
 
@@ -104,10 +104,10 @@ def device_of(session: "InferenceSession") -> str:
 
 
 def words_of(runtime: str, device: str) -> str:
-    """What runs a network, for people: the processor is not worth a word."""
+    """Runtime and device of a network as shown to the user; the CPU is omitted."""
     return runtime if device == "cpu" else f"{runtime} on {device}"
 
 
 def first_line(error: Exception) -> str:
-    """An error's words on one line."""
+    """First line of an error message."""
     return " ".join(str(error).split())[:MAX_REASON]

@@ -1,4 +1,4 @@
-"""Images that repeat the one before them: a frozen camera, a stuck encoder, or a frame rate raised by copies."""
+"""Images that repeat the previous one: a frozen camera, a stuck encoder, or a frame rate raised by copies."""
 
 from collections.abc import Callable
 
@@ -11,9 +11,8 @@ REPEATED = "the image repeats the one before"
 _GRID = 4
 """Every fourth pixel of every fourth row is compared: 30 us per frame of 640x480."""
 _MIN_CHANGE = 0.3
-"""Mean absolute difference [grey levels] above which two images differ. Sensor noise of one level gives 1.1; the
-minimum over nine recordings, including slow ones and bare walls, is 0.99. A still scene through an MPEG-4 encoder
-stays within 0.26, except for key frames."""
+"""Mean absolute difference [grey levels] above which two images differ. Sensor noise of one level gives 1.1, slow
+motion past bare walls 0.99. A static scene through an MPEG-4 encoder stays within 0.26, except for key frames."""
 _LONG_S = 0.3
 """Longer repeats are not copies for the frame rate: 5 images per second played at 30 repeat for 0.17 s."""
 
