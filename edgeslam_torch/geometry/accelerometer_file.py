@@ -19,14 +19,14 @@ _GAPS_S = (1e-4, 1.0)
 _R_CAMERA_KINECT = np.diag([-1.0, -1.0, 1.0])
 """The Kinect's accelerometer has x left, y up, z forward (https://cvg.cit.tum.de/data/datasets/rgbd-dataset)."""
 _KINECT_RAD = math.radians(4.0)
-"""It is not calibrated: 4 degrees off in freiburg1_xyz."""
+"""Standard deviation of its vertical: it is not calibrated."""
 _IMU_RAD = math.radians(1.0)
-"""Biases of 0.1 m/s^2 and the mount's calibration."""
+"""Standard deviation of an IMU's vertical: biases of 0.1 m/s^2 and the calibration of the mount."""
 
 
 def read_specific_force(folders: Sequence[Path]) -> tuple[SpecificForce | None, list[str]]:
-    """The accelerometer of the first folder that has one, and what is wrong with it, in words; gravity is an extra, so
-    that a file which cannot be read is no reason to stop."""
+    """Accelerometer readings of the first folder that has some, and warnings. An unreadable file causes a warning, not
+    an error, because gravity is optional."""
     for folder in folders:
         try:
             if (folder / IMU).is_file() and (folder / MOUNT).is_file():

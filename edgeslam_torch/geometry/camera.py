@@ -33,9 +33,9 @@ class Camera:
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1 k2 p1 p2 k3, in OpenCV's order."""
     source: str = "given"
-    """Where the calibration comes from, in words; part of every summary."""
+    """Origin of the calibration; part of every summary."""
     focal_sigma: float = 0.0
-    """Relative standard deviation of the focal lengths; 0 for a calibration, whose error is negligible against the
+    """Relative standard deviation of the focal lengths; 0 for a calibration, whose error is negligible relative to the
     scale's."""
 
     def __post_init__(self) -> None:

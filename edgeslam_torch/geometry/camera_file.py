@@ -1,4 +1,4 @@
-"""Calibration files: writing ours, reading those of many programs."""
+"""Write calibration files; read those of this and other programs."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,7 +34,7 @@ def save_camera(path: Path, camera: Camera) -> None:
 
 
 def load_camera(name: str | Path) -> Camera:
-    """As `read_camera`, of a file that states its size, without the remarks."""
+    """`read_camera` without the remarks, for a file that contains the image size."""
     return read_camera(name)[0]
 
 
@@ -42,15 +42,15 @@ def read_camera(name: str | Path, size: tuple[int, int] | None = None) -> tuple[
     """Camera from a preset's name or a calibration file, and remarks for the user.
 
     Reads our ``camera.yaml`` and the files of Kalibr, ROS, EuRoC, OpenCV (YAML, XML), ORB-SLAM, VINS, COLMAP, DSO,
-    DPVO, MASt3R-SLAM and nerfstudio; what they state in other words is in `edgeslam_torch.geometry.calibrations.keys`.
+    DPVO, MASt3R-SLAM and nerfstudio; `edgeslam_torch.geometry.calibrations.keys` maps their keys.
 
     Args:
         name: Preset or file.
-        size: ``(width, height)`` of the images, for files that do not state it.
+        size: ``(width, height)`` of the images, for files without it.
 
     Raises:
-        CalibrationError: If there is neither such a preset nor such a file, the file is malformed or holds what is
-            not understood, or its numbers cannot be a camera's.
+        CalibrationError: If there is neither such a preset nor such a file, the file is malformed or has unsupported
+            content, or its numbers are implausible.
     """
     if str(name) in PRESETS:
         return replace(PRESETS[str(name)], source=f"preset {name}"), []
@@ -65,7 +65,7 @@ def read_camera(name: str | Path, size: tuple[int, int] | None = None) -> tuple[
 
 
 def camera_keys(path: Path) -> dict[str, Any]:
-    """Keys and values of a calibration file of any of the formats, as they stand there.
+    """Keys and values of a calibration file in any of the formats, as written.
 
     Raises:
         CalibrationError: If it is malformed.
@@ -83,7 +83,7 @@ def _record(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Every error of a file's content as one line with its name."""
+    """Convert every error of a file's content to one line with its name."""
     try:
         yield
     except OSError as error:

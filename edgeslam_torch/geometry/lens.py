@@ -1,4 +1,4 @@
-"""Plausibility of a calibration: mistyped numbers, wrong units, or a fit to too few pictures."""
+"""Plausibility of a calibration: mistyped numbers, wrong units, or a fit to too few images."""
 
 import numpy as np
 
@@ -11,18 +11,18 @@ FOCAL = (0.1, 20.0)
 _ASPECT = 3.0
 """Maximum ratio of the two focal lengths."""
 _MARGIN = 0.5
-"""How far outside the image the principal point may lie, relative to its width or height."""
+"""Maximum distance of the principal point outside the image, relative to its width or height."""
 _MAX_PULLED = 0.5
 """Minimum ratio of undistorted to distorted distance from the principal point, at the border."""
 _FARTHEST = 10.0
 """Maximum ratio of undistorted to distorted distance, at the border."""
 UNIQUE = 2 / 3
 """Share of the distance to the border within which the distortion must be invertible. Not 1, because real lenses
-modelled with k1 alone (EuRoC's with -0.3) fold at 0.7 of the distance to the corners."""
+modelled with k1 alone (such as -0.3) fold at 0.7 of the distance to the corners."""
 
 
 def check_camera(camera: Camera) -> None:
-    """Reject calibrations that no camera has.
+    """Reject implausible calibrations.
 
     Raises:
         CalibrationError: If focal length, principal point or distortion are impossible.

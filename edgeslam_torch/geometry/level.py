@@ -1,4 +1,4 @@
-"""Where up is: what an accelerometer feels, and what follows from all evidence."""
+"""Specific force of an accelerometer, and the estimated vertical."""
 
 from dataclasses import dataclass
 
@@ -7,19 +7,19 @@ from edgeslam_torch.types import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class SpecificForce:
-    """What an accelerometer fixed to the camera felt: at rest it points up."""
+    """Readings of an accelerometer fixed to the camera: at rest, specific force points up."""
 
     stamps_s: FloatArray
-    """``(M,)`` in time order, on the images' clock [s]."""
+    """``(M,)`` in temporal order, on the images' clock [s]."""
     force_c: FloatArray
     """``(M, 3)`` in the camera's axes [m/s^2]."""
     sigma_rad: float
-    """How far its mean over a recording is off the vertical: bias and mount."""
+    """Standard deviation of the angle between its mean and the vertical: bias and mount."""
 
 
 @dataclass(frozen=True, slots=True)
 class Up:
-    """Where up is in some world, and how well that is known."""
+    """Vertical of a world frame with its uncertainty."""
 
     direction: FloatArray
     """``(3,)`` unit vector."""

@@ -7,7 +7,7 @@ import numpy as np
 from edgeslam_torch.types import FloatArray
 
 TELLO_TILT_RAD, TELLO_FORWARD_M = math.radians(12.0), 0.03
-"""A Tello's camera, within two degrees and a centimetre or so."""
+"""Tilt and offset of a Tello's camera, within two degrees and about a centimetre."""
 
 
 def camera_on_body(tilt_rad: float = TELLO_TILT_RAD, forward_m: float = TELLO_FORWARD_M) -> FloatArray:

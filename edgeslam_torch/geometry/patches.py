@@ -1,8 +1,8 @@
-"""Patches of one image found in another one to a small part of a pixel.
+"""Sub-pixel alignment of patches between two images.
 
 Forward shifts of templates with the Gauss-Newton step of the inverse compositional algorithm (Baker and Matthews, IJCV
-2004, eq. 35, for translations): the gradient is the template's, so that a step costs one look at the image. A template
-is taken as the other camera would see it if the patch were parallel to the image that it comes from.
+2004, eq. 35, for translations): the gradient is the template's, so that a step samples the image once. A template is
+warped to the other camera, assuming a surface parallel to the image that it comes from.
 """
 
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ HALF_PX = 4
 """Half the side of a patch: 9 pixels, the size of a corner with its surroundings."""
 STEPS = 8
 UNLIKE = 0.5
-"""Share of a patch's contrast that is left where it shows something else: most of it."""
+"""Residual relative to a patch's contrast above which the patch shows something else."""
 _DONE_PX = 0.01
 _LONGEST_PX = 1.0
-"""Length of a step at most: gradients say nothing beyond."""
+"""Maximum length of a step, the range of validity of the gradients."""
 _OFFSETS = np.arange(-HALF_PX - 1, HALF_PX + 2, dtype=np.float32)
 _X, _Y = (a.ravel() for a in np.meshgrid(_OFFSETS, _OFFSETS))
 _INNER = np.maximum(np.abs(_X), np.abs(_Y)) <= HALF_PX
@@ -31,30 +31,29 @@ SIDE_PX = len(_OFFSETS)
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Where patches are in an image."""
+    """Positions of patches in an image."""
 
     uv: FloatArray
     """``(N, 2)`` pixels of their centres."""
     sigma_px: FloatArray
-    """``(N,)`` standard deviation along the worst direction if what is left were white noise; infinite for a patch
+    """``(N,)`` standard deviation along the worst direction if the residual were white noise; infinite for a patch
     without structure, and where the image shows something else."""
 
 
 def patch_warps(uv: FloatArray, depth: FloatArray, T_to_from: FloatArray, camera: Camera) -> FloatArray:
-    """How pixels around a point move in one image per pixel in another one, ``(N, 2, 2)``.
+    """Affine warps between two images around points, ``(N, 2, 2)``.
 
     Args:
-        uv: Pixels ``(N, 2)`` of the points in the image that the patches are taken from.
-        depth: Their z-depths ``(N,)`` there, positive; the surface is taken for parallel to the image.
-        T_to_from: ``(4, 4)`` from that camera to the other one, in the unit of the depths; or one a point.
-        camera: Of both images.
+        uv: Pixels ``(N, 2)`` of the points in the source image.
+        depth: Their z-depths ``(N,)`` there, positive; the surface is assumed parallel to the image.
+        T_to_from: ``(4, 4)`` from the source camera to the other one, in the unit of the depths; or one per point.
+        camera: Intrinsics of both images.
 
     Returns:
-        Pixels of the image that they are taken from per pixel of the other; not finite where the point lies in the
-        other camera's plane.
+        Source pixels per pixel of the other image; not finite where the point lies in the other camera's plane.
 
     Example:
-        A camera that comes twice as near sees everything twice as large:
+        Half the distance doubles the size:
 
         >>> from edgeslam_torch.geometry.camera import PRESETS
         >>> forward = np.eye(4)
@@ -80,12 +79,12 @@ def patch_warps(uv: FloatArray, depth: FloatArray, T_to_from: FloatArray, camera
 
 
 def templates(image: NDArray[np.uint8], uv: FloatArray, warps: FloatArray) -> FloatArray:
-    """Grey values ``(N, S, S)`` around points of an image, as another camera would see them.
+    """Grey values ``(N, S, S)`` around points of an image, warped to another camera.
 
     Args:
         image: Grey ``(H, W)``.
         uv: Pixels ``(N, 2)``.
-        warps: ``(N, 2, 2)``, as of `patch_warps`.
+        warps: ``(N, 2, 2)`` from `patch_warps`.
     """
     x = uv[:, :1] + warps[:, 0, :1] * _X + warps[:, 0, 1:] * _Y
     y = uv[:, 1:] + warps[:, 1, :1] * _X + warps[:, 1, 1:] * _Y
@@ -93,12 +92,12 @@ def templates(image: NDArray[np.uint8], uv: FloatArray, warps: FloatArray) -> Fl
 
 
 def find(image: NDArray[np.uint8], uv: FloatArray, patches: FloatArray) -> Found:
-    """Shift patches to where they fit an image best, whatever its brightness.
+    """Align patches with an image by translation, invariant to brightness.
 
     Args:
         image: Grey ``(H, W)``.
-        uv: Pixels ``(N, 2)`` to begin at, right to a pixel or two.
-        patches: As of `templates`.
+        uv: Initial pixels ``(N, 2)``, accurate to a pixel or two.
+        patches: From `templates`.
     """
     t = _level(patches[:, 1:-1, 1:-1])
     gx, gy = (
@@ -136,8 +135,8 @@ def _level(patches: FloatArray) -> FloatArray:
 
 
 def _looked_up(image: NDArray[np.uint8], x: FloatArray, y: FloatArray) -> FloatArray:
-    """Grey values between pixels, ``(N, P)`` float32; the image goes on as at its border."""
-    if len(x) == 0:  # which OpenCV refuses
+    """Interpolated grey values ``(N, P)`` float32; the border is replicated."""
+    if len(x) == 0:  # OpenCV rejects empty arrays
         return np.zeros(x.shape, np.float32)
     grey = cv2.remap(
         image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE

@@ -1,7 +1,7 @@
-"""Pixels that are less certain along some direction: covariance ``I / inv_sigma^2`` plus the sum of ``slack slack^T``.
+"""Pixels with directional uncertainty: covariance ``I / inv_sigma^2`` plus the sum of ``slack slack^T``.
 
-A slack is a direction times a standard deviation: along an edge that a keypoint may have slid along, along an epipolar
-line when the depth is uncertain.
+A slack is a direction times a standard deviation: along an edge (aperture problem), or along an epipolar line for an
+uncertain depth.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Quantiles, robust spreads and weights that several stages share."""
+"""Quantiles, robust standard deviations and weights, shared by several stages."""
 
 from enum import StrEnum
 
@@ -29,14 +29,14 @@ class Kernel(StrEnum):
 
 
 def median(x: FloatArray) -> float:
-    """``np.median`` of a vector ``(N,)``, to the bit, in a fifth of its time for a frame's hundreds of numbers.
+    """``np.median`` of a vector ``(N,)``, bit-identical and five times as fast for hundreds of numbers.
 
     Example:
         >>> median(np.array([4.0, 1.0, 3.0, 2.0]))
         2.5
     """
     ordered, n = np.sort(x), len(x)
-    if n == 0 or np.isnan(ordered[-1]):  # what is no number comes last
+    if n == 0 or np.isnan(ordered[-1]):  # NaN is sorted last
         return float("nan")
     return float(0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]))
 

@@ -1,4 +1,4 @@
-"""Roll, pitch, yaw and rotation vectors in scalar code: the filter turns one pose at a time, where numpy is slow."""
+"""Roll, pitch, yaw and rotation vectors in scalar code: the filter processes single poses, where numpy is slow."""
 
 import math
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ def matrix_from_rpy(rpy: FloatArray) -> FloatArray:
 
 
 def rpy_from_matrix(R: FloatArray) -> FloatArray:
-    """``(roll, pitch, yaw)`` [rad] of a rotation ``(3, 3)``; at a pitch of 90 degrees roll is set to what fits."""
+    """``(roll, pitch, yaw)`` [rad] of a rotation ``(3, 3)``; at a pitch of 90 degrees yaw and roll are ambiguous."""
     pitch = math.asin(max(-1.0, min(1.0, -float(R[2, 0]))))
     roll = math.atan2(float(R[2, 1]), float(R[2, 2]))
     yaw = math.atan2(float(R[1, 0]), float(R[0, 0]))
@@ -64,7 +64,7 @@ def wrapped(angle: FloatArray) -> FloatArray:
 
 
 def turn_left(R: FloatArray) -> FloatArray:
-    """Turn [rad] about the z axis, to the left, that is nearest to rotations ``(..., 3, 3)``.
+    """Angle [rad] about the z axis, positive to the left, nearest to rotations ``(..., 3, 3)``.
 
     Example:
         >>> round(float(turn_left(matrix_from_rpy(np.array([0.0, 0.0, 0.4])))), 6)

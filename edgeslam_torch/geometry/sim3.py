@@ -1,8 +1,8 @@
-"""Similarities ``p' = s R p + t``: how one piece of a monocular map lies in another.
+"""Similarities ``p' = s R p + t``: transforms between submaps of a monocular map.
 
 Tangents are ``(rho, phi, sigma)``: translation, rotation, log of the scale, applied on the left (Strasdat, Montiel and
-Davison, RSS 2010). A similarity is kept as a ``(4, 4)`` matrix with ``s R`` in its upper left block, so that products
-and inverses are those of matrices.
+Davison, RSS 2010). A similarity is a ``(4, 4)`` matrix with ``s R`` in its upper left block, so that products and
+inverses are those of matrices.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray
 
 SMALL = 1e-5
-"""Angle [rad] and log scale below which series take the place of quotients of tiny numbers."""
+"""Angle [rad] and log scale below which series replace ill-conditioned quotients."""
 
 
 def compose(scale: float, R: FloatArray, t: FloatArray) -> FloatArray:
@@ -41,12 +41,12 @@ def inverse(S: FloatArray) -> FloatArray:
 
 
 def transform(S: FloatArray, p: FloatArray) -> FloatArray:
-    """Points ``(N, 3)`` moved by a similarity."""
+    """Points ``(N, 3)`` transformed by a similarity."""
     return p @ S[:3, :3].T + S[:3, 3]
 
 
 def moved_camera(S: FloatArray, T_c_w: FloatArray) -> FloatArray:
-    """``T_c_w`` of a camera whose world was moved by a similarity; a camera has no scale of its own."""
+    """``T_c_w`` of a camera whose world was transformed by a similarity; the scale affects its translation only."""
     scale, R, t = parts(S)
     T = np.eye(4)
     T[:3, :3] = T_c_w[:3, :3] @ R.T
@@ -82,7 +82,7 @@ def log(S: FloatArray) -> FloatArray:
 def fit(a: FloatArray, b: FloatArray) -> FloatArray | None:
     """Similarity that takes points ``a`` to ``b``, ``(N, 3)`` each, with the least squared distance.
 
-    Umeyama, PAMI 1991. None for fewer than three points or for points on one line, which leave a turn free.
+    Umeyama, PAMI 1991. None for fewer than three points or collinear ones, which leave a rotation undetermined.
     """
     if len(a) < 3:
         return None
@@ -100,7 +100,7 @@ def fit(a: FloatArray, b: FloatArray) -> FloatArray | None:
 
 
 def _left(phi: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Integral of ``exp(u (sigma + hat(phi)))`` over ``u`` from 0 to 1, ``(..., 3, 3)``: what turns rho into t."""
+    """Integral of ``exp(u (sigma + hat(phi)))`` over ``u`` from 0 to 1, ``(..., 3, 3)``: maps rho to t."""
     theta, scale = np.linalg.norm(phi, axis=-1), np.exp(sigma)
     # Integrals of exp(u sigma), and of it times sin(u theta) / theta and times (1 - cos(u theta)) / theta^2.
     safe = np.where(np.abs(sigma) > SMALL, sigma, 1.0)

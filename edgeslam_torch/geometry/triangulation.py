@@ -16,7 +16,7 @@ def triangulate(ray_i: FloatArray, ray_j: FloatArray, T_j_i: FloatArray) -> Floa
     """Points ``(N, 3)`` in camera i from rays ``(N, 3)`` (z = 1) in both cameras.
 
     Least squares of the two depths along their rays (mid-point method, Hartley and Zisserman 2004, 12.2), which
-    needs no SVD per point. Points of parallel rays come back as NaN. ``T_j_i`` may be ``(4, 4)`` or ``(N, 4, 4)``.
+    needs no SVD per point. Points of parallel rays are NaN. ``T_j_i`` may be ``(4, 4)`` or ``(N, 4, 4)``.
     """
     R, t = T_j_i[..., :3, :3], T_j_i[..., :3, 3]
     a = (R @ ray_i[..., None])[..., 0]  # d_i * a + t = d_j * b

@@ -1,1 +1,1 @@
-"""Calibration files of other programs: their text, their keys, their lens models."""
+"""Calibration files of other programs: text formats, keys and lens models."""

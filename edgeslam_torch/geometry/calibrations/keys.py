@@ -1,8 +1,7 @@
-"""The keys that calibration files of this field use, and the camera that a record of them describes.
+"""Keys of calibration files, and conversion of a record to a camera.
 
-A key counts without case, separators and the name of the camera before it (``Camera1.fx``, ``image_width``,
-``imageWidth``). Every key is used, known to be harmless, refused because it could be part of a calibration, or named
-in a remark.
+Keys are compared without case, separators and camera prefix (``Camera1.fx``, ``image_width``, ``imageWidth``). Every
+key is either used, ignored as irrelevant, rejected because it could be part of a calibration, or listed in a remark.
 """
 
 import math
@@ -45,7 +44,7 @@ _CANONICAL = {alias: name for name, aliases in _NAMES.items() for alias in alias
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 _OWN_PREFIXES = frozenset(("camera", "camera0", "camera1", "cam", "cam0", "left"))
-"""Before a dot (``Camera1.fx``): the keys count as the file's own."""
+"""Prefixes before a dot (``Camera1.fx``) that are stripped."""
 _OTHER_CAMERA = re.compile(r"(right|depth|ir|infra\w*|camera[2-9]|cam[1-9])(camera)?")
 
 _HARMLESS = re.compile(
@@ -74,7 +73,7 @@ _HARMLESS_GROUPS = re.compile(
     r"(orbextractor|viewer|imu|stereo|rgbd|system|loopclosing|tracking|mapping|preprocessing|feature|pangolin\w*|header"
     r"|stamp|frames|roi|imu\d+|initializer|relocalizer|keyframe\w*|mappublisher|looploader|graphoptimizer|loopdetector)$"
 )
-"""Groups of settings that say nothing about the lens: ORB-SLAM's, stella_vslam's, ROS's."""
+"""Groups of settings irrelevant to the lens: ORB-SLAM's, stella_vslam's, ROS's."""
 _CALIBRATION_LIKE = re.compile(
     r".*(dist(?!ance)|lens|model|coef|fish|omni|focal|princip|intrin|skew|matrix|mirror|radial|tangent|rational|fov|calib"
     r"|undist|decimat).*|[kpsfc]\d*[xyuvr]?\d?|xi|alpha|beta|omega|gamma\d?|crop.*|shear"
@@ -82,15 +81,15 @@ _CALIBRATION_LIKE = re.compile(
 
 
 def camera_of(record: dict[str, Any], source: str, size: tuple[int, int] | None) -> tuple[Camera, list[str]]:
-    """Camera that a record describes, and remarks for the user.
+    """Camera from a record, and remarks for the user.
 
     Args:
-        record: Of `edgeslam_torch.geometry.calibrations.text.record_of`.
+        record: From `edgeslam_torch.geometry.calibrations.text.record_of`.
         source: Name of the file.
-        size: ``(width, height)`` of the images, where the record does not state it.
+        size: ``(width, height)`` of the images, if the record does not contain it.
 
     Raises:
-        CalibrationError: If it describes no camera, or holds what could be part of a calibration and is not read.
+        CalibrationError: If it describes no camera, or contains a possible calibration key that is not supported.
     """
     remarks: list[str] = []
     _refuse_parts(record)
@@ -104,7 +103,7 @@ def camera_of(record: dict[str, Any], source: str, size: tuple[int, int] | None)
     if not _is_zero(stated.get("fisheye", 0)):
         lenses.append("fisheye")
     family = _family(lenses)
-    if "mu" in coefficients:  # camodocal's Kannala-Brandt numbers its four from 2
+    if "mu" in coefficients:  # camodocal's Kannala-Brandt coefficients start at k2
         coefficients = {f"k{int(k[1]) - 1}": x for k, x in coefficients.items() if k != "mu"}
     D = _coefficients(family, coefficients, [*more, *_distortion(stated)])
     if family == lens_models.FOV and "omega" in stated:
@@ -132,8 +131,7 @@ def _plain(key: Any) -> str:
 
 
 def _one_camera(record: dict[str, Any], remarks: list[str]) -> dict[str, Any]:
-    """The first of several cameras (``cam0``, ``cam1``), with what is stated for all; the record if it has no such
-    parts."""
+    """The first of several cameras (``cam0``, ``cam1``) with the common keys; the record itself if it has only one."""
     cameras = [k for k, v in record.items() if re.fullmatch(r"(?i)(cam|camera)[_-]?\d+", str(k)) and _is_group(v)]
     if len(cameras) > 1:
         remarks.append(f"{len(cameras)} cameras in it, {cameras[0]} is used")
@@ -141,12 +139,12 @@ def _one_camera(record: dict[str, Any], remarks: list[str]) -> dict[str, Any]:
 
 
 def _is_group(value: Any) -> bool:
-    """Whether it is a mapping of keys; a matrix with its ``data`` is not."""
+    """Whether it is a mapping of keys and not a matrix with ``data``."""
     return isinstance(value, dict) and "data" not in value
 
 
 def _flat(record: dict[str, Any], remarks: list[str], group: str = "") -> Iterator[tuple[str, str, Any]]:
-    """Key as written, plain key and value of everything outside harmless groups and other cameras."""
+    """Key as written, normalised key and value, without ignored groups and other cameras."""
     for key, value in record.items():
         written = f"{group}{key}"
         prefix, _, last = str(key).rpartition(".")
@@ -162,10 +160,10 @@ def _flat(record: dict[str, Any], remarks: list[str], group: str = "") -> Iterat
 
 
 def _sorted(record: dict[str, Any], remarks: list[str]) -> tuple[dict[str, Any], dict[str, float], list[str]]:
-    """Stated values by canonical name, coefficients by name, and names of lenses.
+    """Values by canonical name, coefficients by name, and names of lens models.
 
     Raises:
-        CalibrationError: If a key could be part of a calibration and is not read, or contradicts another.
+        CalibrationError: If a possible calibration key is not supported, or contradicts another.
     """
     stated: dict[str, Any] = {}
     coefficients: dict[str, float] = {}
@@ -207,7 +205,7 @@ def _put(into: dict[str, Any], name: str, value: Any, written: str) -> None:
 
 
 def _refuse_parts(record: dict[str, Any]) -> None:
-    """Refuse calibrations of a part of the image, ROS's binning and region of interest."""
+    """Reject calibrations of a part of the image: ROS's binning and region of interest."""
     roi = record.get("roi")
     cut = isinstance(roi, dict) and any(roi.get(k) for k in ("x_offset", "y_offset"))
     if isinstance(roi, dict) and not cut:
@@ -217,7 +215,7 @@ def _refuse_parts(record: dict[str, Any]) -> None:
 
 
 def _is_zero(value: Any) -> bool:
-    """Whether a switch is off, or a number zero, also as text."""
+    """Whether a value is false or zero, also as text."""
     return str(value).strip().lower() in ("0", "0.0", "0.", "false", "no", "off")
 
 
@@ -226,10 +224,10 @@ def _is_list(value: Any) -> bool:
 
 
 def _number(key: str, value: Any) -> float:
-    """A finite number, also of text such as ``1e-5``, which YAML does not take for one.
+    """A finite number, also from text such as ``1e-5``, which YAML parses as a string.
 
     Raises:
-        CalibrationError: If it is none.
+        CalibrationError: If it is not a finite number.
     """
     try:
         if isinstance(value, bool) or not isinstance(value, int | float | str):
@@ -296,7 +294,7 @@ def _intrinsics(stated: dict[str, Any], width: int, height: int) -> tuple[float,
     if "c" in stated:
         for name, value in zip(("cx", "cy"), _flat_numbers("principal point", stated["c"]), strict=False):
             _put(stated, name, value, name)
-    if "angle" in stated and "fx" not in stated:  # NeRF's, of the picture's width
+    if "angle" in stated and "fx" not in stated:  # NeRF's horizontal field of view
         stated["fx"] = 0.5 * width / math.tan(0.5 * _number("camera_angle_x", stated["angle"]))
         stated.setdefault("fy", stated["fx"])
         corner = 0.5 if stated.get(CORNER_ORIGIN) else 0.0
@@ -315,14 +313,14 @@ def _looks_like_matrix(numbers: list[float]) -> bool:
 
 def _of_matrix(K: FloatArray) -> tuple[float, float, float, float]:
     if K[2, 0] and not K[0, 2]:
-        K = K.T  # Open3D writes columns
+        K = K.T  # Open3D is column-major
     if K[0, 1] or K[1, 0] or K[2, 0] or K[2, 1]:
         raise CalibrationError("a matrix with skew is not supported")
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
 def _family(lenses: list[str]) -> str:
-    """The one lens model of all that are named; a projection (pinhole) says nothing about distortion."""
+    """The lens model among all names; a projection (pinhole) does not specify the distortion."""
     families = {lens_models.family_of(lens) for lens in lenses} - {lens_models.PINHOLE}
     if len(families) > 1:
         raise CalibrationError(f"it names two lens models, {' and '.join(repr(lens) for lens in sorted(lenses))}")

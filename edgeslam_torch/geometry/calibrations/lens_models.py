@@ -1,4 +1,4 @@
-"""Lens models of other programs, as the five numbers of ours (k1 k2 p1 p2 k3)."""
+"""Lens models of other programs, converted to Brown-Conrady (k1 k2 p1 p2 k3)."""
 
 import re
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ BROWN, RATIONAL, FISHEYE, FOV = "plumb_bob", "rational_polynomial", "equidistant
 INVERSE = "inverse_brown_conrady"
 """RealSense's; supported without distortion only."""
 PINHOLE = ""
-"""A projection without a word about distortion."""
+"""A projection without a specified distortion model."""
 NO_LENS = "none"
 
 _NAMES = {
@@ -31,25 +31,25 @@ _OTHERS = frozenset(
     ("mei", "omni", "omnidirectional", "ds", "doublesphere", "eucm", "ucm", "unified", "thinprismfisheye", "spherical")
     + ("equirectangular", "scaramuzza", "ocam", "ftheta", "polynomial", "division", "radialdivision")
 )
-"""Models that ours cannot be fitted to here."""
+"""Models that are not supported."""
 
 _OPENCV = (1, 2, 4, 5, 8, 12, 14)
 _COUNTS = {BROWN: _OPENCV, RATIONAL: _OPENCV, PINHOLE: _OPENCV, FISHEYE: (4,), FOV: (1,)}
 _MAX_MISFIT_PX = 0.3
-"""Another lens model is replaced by ours if no pixel of the image moves by more; a keypoint is located to about 0.5."""
+"""Maximum pixel error of a fitted lens model; keypoints are localised to about 0.5 px."""
 _MAX_INVERSE_PX = 5.0
-"""How far from a pixel OpenCV's inverse may end; beyond, the corners are not covered."""
+"""Maximum error of OpenCV's inverse; above, the corners of the image are not covered."""
 _GRID = 25
 
 
 def is_distorting(text: str) -> bool:
-    """Whether a word names a lens model with distortion, supported or not."""
+    """Whether a name denotes a lens model with distortion, supported or not."""
     name = _plain(text)
     return name in _OTHERS or _FAMILY.get(name, PINHOLE) not in (PINHOLE, NO_LENS)
 
 
 def family_of(name: str) -> str:
-    """The model that a name of any program stands for.
+    """The lens model denoted by a name of any program.
 
     Raises:
         CalibrationError: If it is not supported.
@@ -64,12 +64,12 @@ def family_of(name: str) -> str:
 
 
 def fit_remark(family: str, misfit_px: float) -> str:
-    """Line for the user about a lens that five numbers stand for."""
+    """Remark for the user about a fitted lens model."""
     return f"its {family} lens is replaced by plumb_bob, up to {misfit_px:.2f} px off"
 
 
 def fov_magnification(omega: float) -> float:
-    """Focal length in the middle of the picture relative to that of the FOV model with angle ``omega`` [rad].
+    """Focal length at the image centre relative to that of the FOV model with angle ``omega`` [rad].
 
     Raises:
         CalibrationError: If no lens has this angle.
@@ -82,16 +82,16 @@ def fov_magnification(omega: float) -> float:
 def five_numbers(
     family: str, D: Sequence[float], K: FloatArray, size: tuple[int, int]
 ) -> tuple[tuple[float, ...], float | None]:
-    """k1 k2 p1 p2 k3 of a lens, and how far a pixel moves by that at most [px]; None where it is the same model.
+    """k1 k2 p1 p2 k3 of a lens, and the maximum error of the fit [px]; None if it is the same model.
 
     Args:
-        family: Of `family_of`.
-        D: Its coefficients in its own order; of a rational lens OpenCV's.
+        family: From `family_of`.
+        D: Its coefficients in its own order; of a rational lens in OpenCV's.
         K: Calibration matrix ``(3, 3)`` [px]; that of a FOV lens with its `fov_magnification`.
         size: ``(width, height)`` of the images [px].
 
     Raises:
-        CalibrationError: If the number of coefficients is wrong, or no five numbers express the lens.
+        CalibrationError: If the number of coefficients is wrong, or the lens cannot be fitted.
     """
     if family == NO_LENS and any(D):
         raise CalibrationError("it states distortion, and a lens model without any")
@@ -114,7 +114,7 @@ def five_numbers(
         return _fitted(family, _fov_rays(D[0], pixels.reshape(-1, 2), K), pixels.reshape(-1, 2), K)
     rays = np.asarray(cv2.undistortPoints(pixels, K, np.array(D)), np.float64).reshape(-1, 2)
     still = np.zeros(3)
-    # OpenCV inverts the model with a few iterations: what it found is fitted where it truly lies.
+    # OpenCV's iterative inverse is inexact: the rays are projected again for exact pairs.
     there, _ = cv2.projectPoints(np.hstack([rays, np.ones((len(rays), 1))]), still, still, K, np.array(D))
     if not np.abs(there - pixels).max() < _MAX_INVERSE_PX:
         raise CalibrationError(
@@ -153,13 +153,13 @@ def _pixels(size: tuple[int, int]) -> FloatArray:
 
 
 def _fitted(model: str, rays: FloatArray, pixels: FloatArray, K: FloatArray) -> tuple[tuple[float, ...], float]:
-    """Our five numbers for points ``rays`` ``(N, 2)`` of the plane z = 1 that another model sees at ``pixels``, and
-    the largest misfit [px].
+    """Brown-Conrady coefficients for points ``rays`` ``(N, 2)`` of the plane z = 1 that another model projects to
+    ``pixels``, and the maximum error [px].
 
     The distorted position is linear in the five.
 
     Raises:
-        CalibrationError: If some pixel is missed by more than `_MAX_MISFIT_PX`.
+        CalibrationError: If the error exceeds `_MAX_MISFIT_PX`.
     """
     focal = np.array([K[0, 0], K[1, 1]])
     seen = (pixels - [K[0, 2], K[1, 2]]) / focal

@@ -1,7 +1,7 @@
-"""Text of a calibration file of any program, as a record of keys and values for `calibrations.keys`.
+"""Parse the text of a calibration file of any program to a record of keys and values for `calibrations.keys`.
 
-YAML and JSON are records already. XML of OpenCV becomes one. Lines of numbers are told apart by their shape: COLMAP's
-``cameras.txt``, DSO's ``camera.txt``, DPVO's line, a matrix.
+YAML, JSON and OpenCV's XML are records. Lines of numbers are distinguished by their shape: COLMAP's ``cameras.txt``,
+DSO's ``camera.txt``, DPVO's line, a matrix.
 """
 
 import json
@@ -14,7 +14,7 @@ from edgeslam_torch.files.record_files import plain_yaml
 MAX_BYTES = 256 << 10
 """Maximum size of a file; those of OpenCV with all corners of the board take 200 kB, and PyYAML 2 s for it."""
 MAX_JSON_BYTES = 16 << 20
-"""Of a JSON file: transforms.json lists every image."""
+"""Maximum size of a JSON file: transforms.json lists every image."""
 
 COLMAP_MODELS = {
     "SIMPLE_PINHOLE": "f cx cy",
@@ -35,14 +35,14 @@ _DSO_MODELS = ("pinhole", "fov", "atan", "radtan", "equidistant", "kannalabrandt
 """First word of DSO's camera.txt, https://github.com/JakobEngel/dso#geometric-calibration-file."""
 _FRAME_KEYS = frozenset(["fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model"])
 CORNER_ORIGIN = "corner_origin"
-"""Key that says that the first pixel's centre is (0.5, 0.5)."""
+"""Key for the convention that the first pixel's centre is (0.5, 0.5)."""
 
 
 def record_of(data: bytes) -> tuple[dict[str, Any], list[str]]:
     """Keys and values of a calibration file, and remarks.
 
     Raises:
-        ValueError: If it is none of the known kinds of text.
+        ValueError: If the format is unknown.
         RecursionError: If it is nested too deeply.
     """
     text = _decoded(data).strip()
@@ -53,7 +53,7 @@ def record_of(data: bytes) -> tuple[dict[str, Any], list[str]]:
     if text.startswith("{"):
         try:
             return _nerfstudio(json.loads(text)), []
-        except json.JSONDecodeError:  # YAML may begin with a brace, too
+        except json.JSONDecodeError:  # YAML may also begin with a brace
             if len(data) > MAX_BYTES:
                 raise
     lines = [
@@ -88,11 +88,10 @@ def _all_numbers(words: list[str]) -> bool:
 
 
 def _nerfstudio(record: dict[str, Any]) -> dict[str, Any]:
-    """A JSON record; that of nerfstudio and instant-ngp, which take over COLMAP's pixels, may have the intrinsics in
-    its frames.
+    """A JSON record; that of nerfstudio and instant-ngp (with COLMAP's pixel convention) may have intrinsics per frame.
 
     Raises:
-        ValueError: If the frames have different ones.
+        ValueError: If the intrinsics of the frames differ.
     """
     frames = record.get("frames")
     if not isinstance(frames, list):
@@ -104,7 +103,7 @@ def _nerfstudio(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _xml(text: str) -> dict[str, Any]:
-    """Record of OpenCV's FileStorage; entities, which can expand to gigabytes, are not read."""
+    """Record of OpenCV's FileStorage; entities, which can expand to gigabytes, are not supported."""
     if "<!" in re.sub(r"(?s)<!--.*?-->", "", text):
         raise ValueError("XML with declarations is not read")
     try:
@@ -138,7 +137,7 @@ def _numbers(lines: list[list[str]], named: bool) -> dict[str, Any]:
         return {"K": [line[:3] for line in lines[:3]]}
     model, values = (lines[0][0], lines[0][1:]) if named else ("", lines[0])
     record: dict[str, Any] = {"intrinsics": values[:4], "distortion": values[4:]}
-    if len(values) == 5:  # the pinhole's fifth number is 0, of the others the angle of the FOV model
+    if len(values) == 5:  # the fifth number is 0 for a pinhole, else the angle of the FOV model
         fov = float(values[4]) != 0.0
         if named and fov and model.lower() not in ("fov", "atan"):
             raise ValueError(f"{model} takes no fifth number that differs from 0")
