@@ -1,4 +1,4 @@
-"""Every setting of the SLAM system with its unit, default and reason. Read from TOML into frozen dataclasses.
+"""Settings of the SLAM system with unit, default and reason. Read from TOML into frozen dataclasses.
 
 One section per stage, collected in `SlamConfig`. Functions take plain arguments or one section, never the whole.
 """
@@ -31,7 +31,7 @@ def _positive(section: object, *names: str) -> None:
 
 
 def _at_most(section: object, **limits: float) -> None:
-    """Upper bounds where larger values only cost gigabytes or hours."""
+    """Check upper bounds; larger values only cost memory or time."""
     for name, limit in limits.items():
         value = getattr(section, name)
         if value > limit:
@@ -71,8 +71,8 @@ class DepthConfig:
     backend: str = "onnxruntime"
     """``onnxruntime`` or ``torch``."""
     device: str = "cpu"
-    """Where it runs: ``auto``, ``cpu``, ``cuda`` or ``mps``. A GPU's last digits are not the processor's, so that runs
-    are repeatable on one device alone."""
+    """Device: ``auto``, ``cpu``, ``cuda`` or ``mps``. Rounding differs between devices; runs are reproducible on the
+    same device only."""
     prior_sigma_log: float = 0.35
     """Standard deviation of log depth without a network; wide enough for a desk and the wall behind it."""
 
@@ -93,17 +93,17 @@ class TrackingConfig:
     map_radius_px: float = 5.0
     """Search radius for the local map once the pose is known from the first pass."""
     max_hamming: int = 64
-    """Bits, of 256; ORB-SLAM2 uses 50 (strict) and 100 (loose)."""
+    """Maximum Hamming distance [bits of 256]; ORB-SLAM2 uses 50 (strict) and 100 (loose)."""
     ratio: float = 0.85
-    """Nearest over second nearest descriptor distance (Lowe)."""
+    """Maximum ratio of nearest to second nearest descriptor distance (Lowe)."""
     min_inliers: int = 25
-    """Below this a pose is not trusted."""
+    """Minimum number of inliers of a pose."""
     local_keyframes: int = 30
     """Maximum number of keyframes in the local map."""
     relocalisation_keyframes: int = 4
     """Keyframes tried in each lost frame."""
     edges: bool = True
-    """Whether edges take part in the pose of frames with few keypoints."""
+    """Use edges for the pose of frames with few keypoints."""
 
     def __post_init__(self) -> None:
         _positive(self, "motion_radius_px", "map_radius_px", "max_hamming", "ratio", "min_inliers", "local_keyframes")
@@ -123,7 +123,8 @@ class FlowConfig:
     levels: int = 4
     """Pyramid levels, each half the size of the previous one."""
     min_share: float = 0.4
-    """Below this share of tracked keypoints, the frame is matched first; of those in view, flow has no say."""
+    """Minimum share of tracked keypoints; below, descriptors are matched first. Below this share of those in view, the
+    pose from flow is rejected."""
 
     def __post_init__(self) -> None:
         _positive(self, "points", "levels", "min_share")
@@ -145,7 +146,7 @@ class InitialisationConfig:
     keyframe_gap_s: float = 0.15
     """Minimum time between the intermediate frames that become keyframes after initialisation."""
     max_keyframes: int = 12
-    """Maximum number of these frames; each costs an inference of the depth network."""
+    """Maximum number of these frames; each requires an inference of the depth network."""
     max_direction_sigma: float = 0.08
     """Standard deviation of the second camera's position relative to the baseline above which initialisation waits:
     0.08 are 4.6 degrees of direction."""
@@ -167,22 +168,22 @@ class MappingConfig:
     keyframe_max_gap_s: float = 0.98
     """Maximum time between keyframes while the camera moves: a second, less half a frame at 30 Hz for rounding."""
     keyframe_followed: float = 0.9
-    """Insert a keyframe when flow tracks fewer than this share of the last one's keypoints: a tenth of a 60-degree
-    view is lost by a turn of 6 degrees."""
+    """Insert a keyframe when flow tracks fewer than this share of the last one's keypoints: a rotation by 6 degrees
+    loses a tenth of a 60-degree view."""
     keyframe_at_once: float = 0.75
-    """Below this share, do not wait for ``keyframe_min_gap_s``: a turn of 15 degrees since the last keyframe, 100
-    degrees a second, would lose half the view meanwhile."""
+    """Below this share, ``keyframe_min_gap_s`` is ignored: after a rotation by 15 degrees since the last keyframe, at
+    100 degrees a second, half the view would be lost meanwhile."""
     keyframe_overlap: float = 0.7
     """Insert a keyframe when fewer than this share of the reference keyframe's anchors is matched."""
     keyframe_parallax_deg: float = 3.0
     """Insert a keyframe when the median parallax to the reference exceeds this: a pixel at 525 px focal length is
     then 4 % of the depth."""
     max_keyframes: int = 200
-    """Number of keyframes in the map from which on those go of whose anchors most are seen by others. The only views of
-    places stay, up to twice as many. Bounds memory and time."""
+    """Number of keyframes in the map from which on the most redundant are removed. The only views of places are kept,
+    up to twice this number. Limits memory and time."""
     redundancy: float = 0.95
-    """A keyframe is redundant when this share of its anchors is observed by three others; the rest of 300 anchors are
-    15, as many as make two keyframes covisible."""
+    """A keyframe is redundant when this share of its anchors is observed by three others; of 300 anchors, 15 remain,
+    the threshold of covisibility."""
     neighbours: int = 6
     """Neighbouring keyframes used to triangulate new anchors."""
     min_parallax_deg: float = 1.0
@@ -190,13 +191,13 @@ class MappingConfig:
     window: int = 10
     """Keyframes refined together (the paper says "short")."""
     window_fixed: int = 15
-    """Fixed keyframes outside the window, which hold its gauge."""
+    """Fixed keyframes outside the window, which fix its gauge."""
     sub_pixel: bool = True
-    """Align keypoints of keyframes with the first views of their anchors. Off, corners stay on whole pixels of their
-    octave (the paper)."""
+    """Align keypoints of keyframes with the first views of their anchors. If off, corners are at whole pixels of their
+    octave (as in the paper)."""
     loop_closure: bool = True
-    """Recognise places of the same piece of map after a long way, and spread the drift over the way between. Off, only
-    drift of a few pixels is made up for (the paper has no loop closure)."""
+    """Detect revisited places of the same submap and distribute the drift over the loop. If off, only drift of a few
+    pixels is corrected (the paper has no loop closure)."""
 
     def __post_init__(self) -> None:
         _positive(
@@ -227,8 +228,7 @@ class EdgeConfig:
     max_pixels: int = 5000
     """Edge pixels kept per keyframe, evenly thinned."""
     delay_keyframes: int = 3
-    """Keyframes that must follow before a keyframe's edges are measured: then there are views from both sides, with
-    refined poses."""
+    """Number of later keyframes before a keyframe's edges are measured, so that refined views from both sides exist."""
     targets: int = 5
     """Keyframes searched for each edge."""
     max_sigma: float = 0.025
@@ -255,7 +255,7 @@ _FLYING_FORMS: dict[str, tuple[Any, Any]] = {
     "angle": ("arms", "off"),
     "collinearity": ("relative", "off"),
 }
-"""Losses of the windows while flying: default form, and what says that one is off."""
+"""Losses of the windows in flight: default form, and the value that disables each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,13 +263,13 @@ class WindowConfig:
     """Stage 4: which losses refine poses, anchors and edge depths, and in which form.
 
     Each term is off, in the default form, or ``literal``: the paper's equation as printed
-    (``docs/theory/README.md``). Edge and corner terms join the last refinement, after all edges are measured, and the
-    windows while flying as ``in_flight`` says.
+    (``docs/theory/README.md``). Edge and corner terms are used in the last refinement, after all edges are measured,
+    and in the windows in flight according to ``in_flight``.
     """
 
     reprojection: str = "robust"
     """``robust``: whitened by octave, Huber kernel; ``literal``: eqs. 15-16, plain squared pixels; ``off``: no
-    refinement while flying, and anchors are not refined."""
+    refinement in flight, and anchors are not refined."""
     alignment: bool = True
     """Distance of projected edge pixels from their partner edge, along its normal; not in the paper."""
     cycle: str = "relative"
@@ -289,18 +289,18 @@ class WindowConfig:
     targets: int = 3
     """Neighbouring keyframes in which each edge pixel is associated."""
     in_flight: str = "few"
-    """Where edge and corner terms join the windows while flying: ``off``, where the newest keyframe's image has ``few``
-    clear corners (``orb.fast_faint`` was needed) or it has fewer than 100 anchors, or ``always``."""
+    """Windows in flight with edge and corner terms: ``off``; ``few``: if the newest keyframe's image has few strong
+    corners (``orb.fast_faint`` was needed) or it has fewer than 100 anchors; or ``always``."""
     in_flight_losses: tuple[str, ...] = ("alignment", "cycle")
-    """Which of ``alignment``, ``cycle``, ``angle`` and ``collinearity``, each in the form chosen above or, if that is
-    off, its default."""
+    """Subset of ``alignment``, ``cycle``, ``angle`` and ``collinearity`` in flight, each in the form selected above or,
+    if that is off, its default."""
     in_flight_edges: int = 300
-    """Edge pixels per keyframe there, each associated in two neighbours."""
+    """Edge pixels per keyframe in flight, each associated in two neighbours."""
     solver: str = "compiled"
-    """Residuals by ``compiled`` loops, or by the ``modules`` of `edgeslam_torch.losses`: the same, far slower."""
+    """Residuals by ``compiled`` loops, or by the ``modules`` of `edgeslam_torch.losses`: same values, far slower."""
     telemetry: str = "every"
-    """Where the drone's displacements, heights and gravity keep the map's scale and level the same all over: in
-    ``every`` refinement, in the ``last`` one, or ``off``."""
+    """Use the drone's displacements, heights and gravity to constrain the map's scale and level: in ``every``
+    refinement, in the ``last`` one, or ``off``."""
 
     def __post_init__(self) -> None:
         _positive(self, "rounds", "edges_per_keyframe", "targets", "in_flight_edges")
@@ -322,7 +322,7 @@ class WindowConfig:
 
     @property
     def flying(self) -> "WindowConfig | None":
-        """The terms of the windows while flying; None without edge and corner terms."""
+        """The terms of the windows in flight; None without edge and corner terms."""
         if self.in_flight == "off" or not self.in_flight_losses:
             return None
         form: dict[str, Any] = {}
@@ -361,7 +361,7 @@ class SlamConfig:
     """All settings of `EdgeSlam`."""
 
     seed: int = 0
-    """Seed of the robust estimators; the same seed and input give the same bytes out."""
+    """Seed of the robust estimators; output is reproducible for the same seed and input."""
     orb: OrbConfig = field(default_factory=OrbConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

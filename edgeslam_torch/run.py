@@ -61,9 +61,9 @@ class Mode(StrEnum):
     """How frames are fed to the system."""
 
     OFFLINE = "offline"
-    """Sequentially, none dropped; the same input gives the same bytes out."""
+    """Sequentially, without dropped frames; the output is reproducible to the byte."""
     REALTIME = "realtime"
-    """At the pace of their stamps; frames that cannot be processed in time are dropped and counted."""
+    """In real time by their stamps; frames that cannot be processed in time are dropped and counted."""
 
 
 class Slam(Protocol):
@@ -79,7 +79,7 @@ class Slam(Protocol):
         """Pose of one frame."""
 
     def finish(self) -> None:
-        """Last refinement."""
+        """Run the last refinement."""
 
     def close(self) -> None:
         """Stop background threads."""
@@ -94,7 +94,7 @@ class Slam(Protocol):
         """Triangulated anchors."""
 
     def observations(self) -> Observations:
-        """Where keyframes saw the anchors."""
+        """Observations of the anchors in keyframes."""
 
     def keyframes(self) -> Sequence[Any]:
         """Keyframes in the map."""
@@ -106,28 +106,28 @@ class Slam(Protocol):
         """Losses of the final map by name; empty before `finish`."""
 
     def support(self) -> Support:
-        """What supports each frame's final pose."""
+        """Evidence for each frame's final pose."""
 
     def pieces(self) -> list[Piece]:
-        """Pieces of map that the frames belong to."""
+        """Submaps that the frames belong to."""
 
     def joins(self) -> Sequence[Any]:
-        """Pieces that were joined; ``str`` gives the evidence."""
+        """Merged submaps; ``str`` gives the evidence."""
 
     def closures(self) -> Sequence[Any]:
-        """Loops that were closed, likewise."""
+        """Closed loops; ``str`` gives the evidence."""
 
     def warnings(self) -> list[str]:
-        """Limits of the results, one line each."""
+        """Limitations of the results, one line each."""
 
     def load_atlas(self, saved: "SavedAtlas") -> None:
-        """Fly in the map of earlier flights."""
+        """Load the map of earlier flights."""
 
     def saved_atlas(self, flight: str) -> "SavedAtlas":
         """The map for the next flight."""
 
     def earlier_flights(self) -> dict[str, Any] | None:
-        """What became of the atlas that was loaded."""
+        """Statistics of the loaded atlas."""
 
     @property
     def scale(self) -> ScaleEstimate:
@@ -143,18 +143,18 @@ class Listener(Protocol):
     def on_finish(self, slam: Slam) -> None:
         """Called once, after the last refinement, before the results are written.
 
-        A listener that has ``on_last_frame(slam)``, too, is called before the last refinement.
+        A listener with a method ``on_last_frame(slam)`` is also called before the last refinement.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class AtlasFiles:
-    """Maps of earlier flights and for later ones."""
+    """Map to load and file to save the map to."""
 
     load: "SavedAtlas | None" = None
-    """To fly in."""
+    """Map of earlier flights; None for none."""
     save: Path | None = None
-    """File to write the map to in the end."""
+    """File to write the map to at the end; None for none."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -163,15 +163,15 @@ class RunResult(Record):
 
     folder: Path
     summary: dict[str, Any]
-    """As in ``summary.json``."""
+    """Content of ``summary.json``."""
     stamps_s: FloatArray
     """``(F,)``"""
     T_w_c: FloatArray
     """``(F, 4, 4)`` refined."""
     interrupted: bool
-    """Whether Ctrl-C ended it."""
+    """Whether it was ended by Ctrl-C."""
     failure: str | None
-    """Output that could not be written; None if all was."""
+    """Error of output that could not be written; None without errors."""
 
 
 def run(
@@ -190,16 +190,15 @@ def run(
 
     Args:
         source: From `open_source`.
-        out_dir: Folder for the results; made when missing. An older run in it is replaced after the first frame.
+        out_dir: Folder for the results; created if missing. An older run in it is replaced after the first frame.
         config: Settings; the defaults when None.
         mode: How frames are fed.
         listeners: Called after every frame.
         make_slam: Builds the system from camera, settings and whether it runs in real time; `EdgeSlam` when None.
-        atlas: Maps of earlier flights and for later ones; none by default.
+        atlas: Map to load and file to save the map to; none by default.
 
     Raises:
-        OutputError: If the folder cannot be written to at all, holds files that no run wrote, or another run writes
-            into it.
+        OutputError: If the folder is not writable, contains files that no run wrote, or is in use by another run.
         SourceError: If the source provides no frame, or fails during the run (after the results are written).
     """
     config, atlas = config or SlamConfig(), atlas or AtlasFiles()
@@ -214,7 +213,7 @@ def run(
 
 
 def settle_camera(source: Source) -> None:
-    """Replace a guessed focal length by an estimate from the first images, or record why there is none.
+    """Replace a guessed focal length by an estimate from the first images, or store the reason for its absence.
 
     Not for live sources, whose images cannot be read twice.
     """
@@ -260,7 +259,7 @@ class _Run:
         self.dropped = Counter()
         self.interrupt = _Interrupt()
         self.stopped_by: str | None = None
-        """What ended the loop before its time, in words."""
+        """Reason why the loop ended early, as text."""
         self.result: RunResult | None = None
         self.last_index: int | None = None
 
@@ -272,7 +271,7 @@ class _Run:
             except BaseException as error:
                 self.stopped_by = " ".join(str(error).split()) or type(error).__name__
                 raise
-            finally:  # also when the source fails: keep what was done so far
+            finally:  # also if the source fails: write the results so far
                 if self.tally.frames:
                     self._write(time.perf_counter() - wall, cpu)
         if self.result is None:
@@ -327,13 +326,13 @@ class _Run:
         return read_ahead(pairs()) if ahead else pairs()
 
     def _count_missed(self, frame: Frame) -> None:
-        """A live source provides the newest image; skipped ones are gaps in its index."""
+        """Count skipped images of a live source, which appear as gaps in the index."""
         if self.source.live and self.last_index is not None:
             self.dropped.value += max(0, frame.index - self.last_index - 1)
         self.last_index = frame.index
 
     def _next(self, frames: Iterator[tuple[Frame, Any]]) -> tuple[Frame, Any] | None:
-        """The next frame with its features; None at the end or when the user stops, even if the source is waiting."""
+        """The next frame with its features; None at the end or on a stop request, even while the source blocks."""
         if self.interrupt.requested:
             return None
         self.interrupt.at_once = True
@@ -355,7 +354,7 @@ class _Run:
             logger.warning("stopped before the last refinement finished")
         self.interrupt.writing = True
         finish_s = time.perf_counter() - started
-        self.slam.close()  # a consistent snapshot follows, even if the refinement was stopped
+        self.slam.close()  # results are consistent afterwards, even if the refinement was interrupted
         stamps, poses = self.slam.trajectory()
         edge_map, anchors, scale = self.slam.edge_map(), self.slam.anchors(), self.slam.scale
         up = getattr(self.slam, "up", None)
@@ -405,7 +404,7 @@ class _Run:
         missing = self.writer.finish(summary, stamps, poses, support, edge_map, anchors, scale.units, extras)
         atlas = None if self.atlas.save is None else str(self.atlas.save.resolve())
         if atlas is not None and any(line.startswith(atlas) for line in missing):
-            summary["saved_atlas"] = None  # it was announced before it could be written
+            summary["saved_atlas"] = None  # the entry was set before writing failed
             with suppress(OSError):
                 write_text(self.writer.folder / SUMMARY, summary_text(summary))
         self.result = RunResult(
@@ -481,7 +480,7 @@ def _load_slam() -> None:
 
 
 class _CallableModule(ModuleType):
-    """``edgeslam_torch.run`` is this module and, called, its `run`: an import of either name finds both."""
+    """Makes this module callable as its function `run`, since both have the name ``edgeslam_torch.run``."""
 
     __call__ = staticmethod(run)
 

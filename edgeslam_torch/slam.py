@@ -71,9 +71,9 @@ from edgeslam_torch.types import (
 )
 
 _AROUND = 8
-"""Keyframes whose anchors are around the newest frame."""
+"""Number of keyframes whose anchors are the surroundings of the newest frame."""
 _SEEN_AGAIN = 12
-"""Keyframes in which its edges are looked for."""
+"""Maximum number of keyframes for stereo with its edges."""
 
 
 class EdgeSlam:
@@ -122,8 +122,8 @@ class EdgeSlam:
         self._losses: dict[str, float] = {}
         self._force: SpecificForce | None = None
         self.up: Up | None = None
-        """Where up is in the published world, after `finish`: z, but in the axes of an earlier flight. None if that is
-        not known; z is then what the first camera had for up."""
+        """Vertical in the output frame after `finish`: z, unless the axes are those of a loaded map. None if unknown; z
+        is then the first camera's up axis."""
         self._T_b_c = camera_on_body(np.deg2rad(config.mount.tilt_deg), config.mount.forward_m)
         if executor is None and realtime:
             executor = ThreadPoolExecutor(1, thread_name_prefix="mapping")
@@ -145,7 +145,7 @@ class EdgeSlam:
             self.events["keyframes_skipped"] = 0
         self._finished = False
         self._present = Present()
-        """What `pose_now` and `health` rest on: replaced as a whole, never changed."""
+        """Immutable state for `pose_now` and `health`, replaced atomically."""
         self._machine = Machine()
         atlas = Atlas(
             self._system.tracker,
@@ -178,25 +178,25 @@ class EdgeSlam:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop what runs in the background; results can still be read."""
+        """Stop background threads; results remain readable."""
         self.close()
 
     @property
     def state(self) -> State:
-        """Current state: what the newest pose is based on."""
+        """Current state of the system."""
         return self._machine.state
 
     @property
     def events(self) -> dict[str, int]:
-        """Counts of losses, relocalisations, restarts and refused initialisations."""
+        """Counts of tracking losses, relocalisations, restarts and rejected initialisations."""
         return self._system.events
 
     # -- one frame ---------------------------------------------------------------------------------------------
 
     def load_atlas(self, saved: SavedAtlas) -> None:
-        """Fly in the map of earlier flights; to be called before the first frame.
+        """Load the map of earlier flights; call before the first frame.
 
-        The flight begins a piece of its own, until a place of the atlas is recognised.
+        The flight starts its own submap until a place of the atlas is recognised.
         """
         if self.map.keyframes:
             raise ValueError("an atlas is loaded before the first frame")
@@ -205,10 +205,10 @@ class EdgeSlam:
         self._joining.atlas.known_scale.update(enumerate(saved.scale))
 
     def saved_atlas(self, flight: str) -> SavedAtlas:
-        """The map as it is now, in published units, for the next flight.
+        """The current map in the units of the output, for the next flight.
 
         Args:
-            flight: Name of this flight, added to those that the atlas was made of.
+            flight: Name of this flight, appended to the atlas's list.
         """
         shown, estimate, published = self.support().largest(), self.scale, self._system.published
         relative = replace(estimate, value=estimate.value / published.scale, sigma=estimate.sigma / published.scale)
@@ -246,7 +246,7 @@ class EdgeSlam:
         Raises:
             SourceError: If the image is not of the camera's size, or the stamp does not increase.
             TypeError, ValueError: If the frame is no `Frame` of a uint8 image, or telemetry no list of
-                `TelemetrySample`; nothing has changed then.
+                `TelemetrySample`; the state is unchanged.
         """
         check_frame(frame)
         check_telemetry(telemetry)
@@ -265,11 +265,11 @@ class EdgeSlam:
             system.has_telemetry = system.has_telemetry or len(telemetry) > 0
         if not self.log.records:
             system.fusion.orientation.began_s = frame.stamp_s
-        if not self.log.records and telemetry:  # the first camera turns so that the world's z is up
+        if not self.log.records and telemetry:  # attitude of the first camera, so that the world's z is up
             system.motion.T_c_w = se3.inverse(first_pose(telemetry[-1].rpy_rad, self._T_b_c))
             upright = bool(np.isfinite(telemetry[-1].rpy_rad).all())
             system.published = replace(system.published, upright=upright)
-            # In a map of an earlier flight, axes are those of that flight.
+            # A loaded map keeps its axes.
             system.fusion.orientation.began_upright = self._earlier is None and upright
         step = self._step(frame, seen)
         if self._earlier is not None:
@@ -281,17 +281,17 @@ class EdgeSlam:
         return self._output(frame, step, joined)
 
     def pose_now(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> PoseNow | None:
-        """Where the camera is at a moment after the newest frame; callable from any thread while frames are stepped.
+        """Predicted pose at a time after the newest frame; callable from any thread while frames are processed.
 
-        With telemetry the video's delay is made up for: the frame stamped ``t`` shows the world at ``t - delay``, and
+        With telemetry the video's delay is compensated: the frame stamped ``t`` shows the world at ``t - delay``, and
         telemetry received since propagates the pose to the present.
 
         Args:
-            stamp_s: The moment, on the clock that stamps frames and telemetry.
-            telemetry: State messages that arrived since the last call of `step`.
+            stamp_s: Time [s] on the clock of frames and telemetry.
+            telemetry: State messages received since the last call of `step`.
 
         Returns:
-            The pose in the world of `SlamOutput.T_w_c`; ``None`` before the first frame with a place in a map.
+            The pose in the world of `SlamOutput.T_w_c`; ``None`` before the first frame with a pose.
         """
         return self._present.pose_at(stamp_s, telemetry)
 
@@ -312,7 +312,7 @@ class EdgeSlam:
     # -- results -----------------------------------------------------------------------------------------------
 
     def finish(self) -> None:
-        """Refine the whole map, measure the remaining edges and fix the published scale after the last frame."""
+        """After the last frame: refine the whole map, measure the remaining edges and finalise the scale."""
         self._system.collect(wait=True)
         self._joining.finish()
         if self._earlier is not None:
@@ -331,12 +331,12 @@ class EdgeSlam:
         self._calibration_warning = calibration_warning(self.camera, self._shown_keyframes(), self.map.anchors.p_w)
 
     def feel(self, force: SpecificForce) -> None:
-        """Accelerometer readings over the whole recording; they only determine the vertical."""
+        """Set accelerometer readings of the whole recording; they only determine the vertical."""
         self._force = force
 
     def _find_up(self) -> None:
-        """By the drone's attitude, which the world follows already; else by accelerometer and edges, after which it is
-        turned, unless its axes are those of an earlier flight."""
+        """Determine the vertical: from the drone's attitude, with which the world is aligned already; else from
+        accelerometer and edges, after which the world is rotated, unless its axes are those of a loaded map."""
         system = self._system
         if system.published.upright and (self._earlier is None or system.fusion.orientation.began_upright):
             self.up = Up(np.array([0.0, 0.0, 1.0]), self.config.fusion.alignment_sigma_rad, "telemetry")
@@ -373,11 +373,10 @@ class EdgeSlam:
         return self._system.published.cloud(cloud)
 
     def surroundings(self) -> tuple[FloatArray, FloatArray]:
-        """Triangulated anchors ``(N, 3)`` and edge points ``(M, 3)`` float64 of keyframes that see what the newest
-        frame sees, as published.
+        """Triangulated anchors ``(N, 3)`` and edge points ``(M, 3)`` float64 of keyframes covisible with the newest
+        frame, in the output frame.
 
-        For obstacle detection, without the map of other rooms: a consistent snapshot in a millisecond; both whole maps
-        take thirty to fifty.
+        For obstacle detection: a consistent snapshot in a millisecond; both whole maps take thirty to fifty.
         """
         if not self.log.records:
             return np.zeros((0, 3)), np.zeros((0, 3))
@@ -395,11 +394,12 @@ class EdgeSlam:
 
         Args:
             image: The newest frame, undistorted.
-            nearest: Minimum depth, in published units.
+            nearest: Minimum depth in the units of the output.
             farthest: Maximum depth.
 
         Returns:
-            Undistorted pixels ``(N, 2)`` and z-depths ``(N,)`` in published units; none before the first frame.
+            Undistorted pixels ``(N, 2)`` and z-depths ``(N,)`` in the units of the output; empty before the first
+            frame.
         """
         if not self.log.records:
             return np.zeros((0, 2)), np.zeros(0)
@@ -415,7 +415,7 @@ class EdgeSlam:
         return uv, unit * z
 
     def observations(self) -> Observations:
-        """Where keyframes saw the anchors of `anchors`, as a consistent snapshot."""
+        """Observations of the anchors of `anchors` in keyframes, as a consistent snapshot."""
         with self.map.lock:
             return observations(self._shown_keyframes(), self.map)
 
@@ -440,23 +440,23 @@ class EdgeSlam:
         return self._system.fusion.scale()
 
     def support(self) -> Support:
-        """What supports the pose of each frame so far."""
+        """Evidence for the pose of each frame so far."""
         return self.log.support()
 
     def pieces(self) -> list[Piece]:
-        """Pieces of map that the frames belong to; the transforms between them are unknown."""
+        """Submaps that the frames belong to; the transforms between them are unknown."""
         return self.log.pieces()
 
     def joins(self) -> list[Join]:
-        """Pieces that were found to be one, with the evidence, in the order of time."""
+        """Merged submaps with the evidence, in temporal order."""
         return list(self._joining.atlas.joins)
 
     def closures(self) -> list[Closure]:
-        """Loops closed inside a submap, with their statistics, in the order of time."""
+        """Loops closed inside a submap, with their statistics, in temporal order."""
         return list(self._joining.atlas.closures)
 
     def earlier_flights(self) -> dict[str, Any] | None:
-        """What became of the atlas that was loaded, in numbers; None without one."""
+        """Statistics of the loaded atlas; None without one."""
         if self._earlier is None:
             return None
         return self._earlier.summary(self.support(), self.map)
@@ -470,7 +470,7 @@ class EdgeSlam:
         return dict(self._losses)
 
     def warnings(self) -> list[str]:
-        """Limits of the results, in sentences for the run's summary."""
+        """Limitations of the results, as sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
         map_mismatch = None if self._earlier is None else self._earlier.warning(self.support())
         upright = self._system.published.upright
