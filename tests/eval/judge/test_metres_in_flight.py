@@ -26,9 +26,9 @@ def test_what_a_pilot_knows_is_moved_with_its_metres_and_the_drone_is_where_it_s
         tello.send(sticks(tello.clock_s))
         if before is not None and before.revision > 0 and state.revision != before.revision:
             assert state.view is not None and state.map_update is not None
-            ratios.append(state.update.ratio)
+            ratios.append(state.map_update.ratio)
         if state.map_update is not None:
-            carried = state.update.points(before.p_w[None])[0]
+            carried = state.map_update.points(before.p_w[None])[0]
             assert np.linalg.norm(carried - state.p_w) < 0.1
         before = state
     assert any(abs(ratio - 1.0) > 0.01 for ratio in ratios), "its metres did become others"
