@@ -20,7 +20,7 @@ def test_consistent_estimates_are_all_used():
     assert settled.warning is None
 
 
-def test_one_wrong_network_does_not_drag_two_right_sensors_along():
+def test_wrong_network_is_rejected_when_two_sensors_agree():
     """Half of a real drone's flight: 2.92 by velocities, 3.06 by height, 3.02 in truth, .92 by the network."""
     told, network = opinion(2.99, 0.02, "telemetry+height"), opinion(0.92, 0.15, "depth")
     settled = settled_with_network(told, network, in_domain=True)
@@ -30,7 +30,7 @@ def test_one_wrong_network_does_not_drag_two_right_sensors_along():
     assert "the network is not used" in settled.warning
 
 
-def test_a_sensor_alone_is_believed_over_the_network_but_not_when_one_of_them_is_nonsense():
+def test_single_sensor_overrules_the_network_except_for_gross_errors():
     network = opinion(1.0, 0.16, "depth")
     off = settled_with_network(opinion(1.7, 0.02, "telemetry"), network, in_domain=True)
     assert [o.source for o in off.used] == ["telemetry"]
@@ -39,7 +39,7 @@ def test_a_sensor_alone_is_believed_over_the_network_but_not_when_one_of_them_is
     assert "right unit" in unit.warning
 
 
-def test_a_network_out_of_its_domain_tells_nothing_but_still_contradicts_nonsense():
+def test_network_out_of_domain_is_unused_but_still_detects_gross_errors():
     network = opinion(0.07, 0.6, "depth")
     assert settled_with_network(None, network, in_domain=False).used == ()
     right = opinion(0.2, 0.01, "telemetry")
@@ -47,17 +47,17 @@ def test_a_network_out_of_its_domain_tells_nothing_but_still_contradicts_nonsens
     assert settled_with_network(opinion(2.0, 0.01, "telemetry"), network, in_domain=False).used == ()
 
 
-def test_an_atlas_that_telemetry_contradicts_is_not_used_and_named():
+def test_contradicted_atlas_is_rejected_with_a_warning():
     settled = settled_with_network(opinion(1.3, 0.02, "telemetry+height"), opinion(1.0, 0.02, "atlas"), True)
     assert [o.source for o in settled.used] == ["telemetry+height"]
     assert "the atlas contradict" in settled.warning and "network" not in settled.warning
 
 
-def test_nothing_told_is_nothing_used():
+def test_no_estimates_give_no_scale():
     assert settled_with_network(None, None, in_domain=False).used == ()
 
 
-def test_a_witness_confirms_one_of_two():
+def test_third_estimate_decides_between_two():
     fast, high = opinion(10.0, 0.03, "telemetry"), opinion(1.05, 0.05, "height")
     assert sided_with(fast, high, opinion(1.1, 0.2, "depth")) == high
     assert sided_with(fast, high, opinion(9.0, 0.2, "depth")) == fast

@@ -135,14 +135,14 @@ def test_wild_anchors_do_not_bend_the_slope(rng):
     assert compared(network, z).slope == pytest.approx(0.7, abs=0.03)
 
 
-def test_few_or_unusable_anchors_say_nothing():
+def test_few_or_unusable_anchors_give_no_ratio():
     z = np.ones(20)
     assert compared(z[:7], z[:7]) is None
     assert compared(np.r_[np.full(13, np.nan), z[:7]], z) is None
     assert compared(z, np.r_[np.full(13, -1.0), z[:7]]) is None
 
 
-def test_ratios_that_are_no_numbers_are_ignored():
+def test_non_finite_ratios_are_ignored():
     held = DepthRatios(LEAST)
     for pair in [(math.nan, 0.1), (0.0, math.inf), (0.1, 0.0)]:
         held.add(DepthRatio(*pair))

@@ -240,7 +240,7 @@ def leaning(pitch_deg, **changes):
     return model_of([TelemetrySample(0.1 * k, np.zeros(3), a) for k, a in enumerate(rpy)], **changes)
 
 
-def test_while_no_metres_are_known_attitude_is_no_vertical_where_it_leans_as_a_hand_does():
+def test_strong_lean_gives_no_vertical_before_the_scale_is_known():
     """A drone that takes off leans by some degrees. A map of a camera that only turns has no parallax to tell a lean of
     half a degree from motion: held by attitude its depths run away."""
     for lean_deg, told in ((6.0, True), (20.0, False)):

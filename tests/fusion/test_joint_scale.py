@@ -267,7 +267,7 @@ def test_heights_of_an_old_climb_are_less_sure_of_the_present_scale(rng):
     assert sigmas[2] < 0.8 * sigmas[1]
 
 
-def test_a_map_ages_most_while_it_is_young():
+def test_log_age_grows_most_in_a_new_map():
     aged = aged_since(np.array([-1.0, 0.0, 1.0, 9.0, 19.0]), 0.0, 19.0)
     assert aged == pytest.approx([math.log(20.0), math.log(20.0), math.log(10.0), math.log(2.0), 0.0])
 

@@ -43,7 +43,7 @@ def test_scale_gravity_and_delay_come_out_of_a_swung_camera(rng, swinging, repla
 
 
 @pytest.mark.parametrize(("delay_s", "latest_s"), [(0.5, 2.8), (0.3, 5.8), (0.75, 5.8)])
-def test_a_climb_tells_the_scale_within_its_sigma(delay_s, latest_s, swinging, replay):
+def test_climb_gives_the_scale_within_its_sigma(delay_s, latest_s, swinging, replay):
     """Up by 0.8 m in 1.6 s, then on: after four half seconds; where the delay is not the guess heights are off by a
     tenth, velocities do not bear them out, and it takes until the delay is known."""
     t = np.arange(0.0, 6.0, 0.05)
@@ -63,7 +63,7 @@ def test_a_climb_tells_the_scale_within_its_sigma(delay_s, latest_s, swinging, r
     assert np.max(np.abs(off)) < 2.5
 
 
-def test_a_climb_guesses_the_unit_before_anything_has_proven_telemetry(swinging, replay):
+def test_climb_gives_a_provisional_scale_before_validation(swinging, replay):
     """Within a second and a half; no longer once telemetry tells the scale. The network is a half off."""
     motion = take_off(swinging(1.0), np.arange(0.0, 5.0, 0.05))
     for seed in range(4):
@@ -85,7 +85,7 @@ def test_a_climb_guesses_the_unit_before_anything_has_proven_telemetry(swinging,
         assert fusion.metres.guess is None
 
 
-def test_a_camera_that_stays_where_its_drone_climbs_guesses_nothing(swinging, replay):
+def test_no_provisional_scale_without_visual_climb(swinging, replay):
     """Telemetry of another flight."""
     motion = take_off(swinging(1.0), np.arange(0.0, 3.0, 0.05))
     still = replace(motion, T_w_c=np.repeat(motion.T_w_c[:1], len(motion.T_w_c), axis=0))
@@ -206,7 +206,7 @@ def test_hovering_holds_the_scale(rng, swinging, replay):
     assert fusion.scale().value == pytest.approx(before.value, rel=0.01), "half a sigma: old intervals count less"
 
 
-def test_depth_alone_gives_metres_with_its_own_doubt(swinging):
+def test_depth_network_alone_gives_a_scale_with_its_sigma(swinging):
     fusion = MotionFusion(FusionConfig(), T_B_C)
     for _ in range(50):
         fusion.metres.add_depth_ratio(DepthRatio(math.log(3.0), 0.05))
@@ -231,7 +231,7 @@ def test_metres_of_an_earlier_flight_take_the_place_of_the_networks():
     assert fusion.scale() == own
 
 
-def test_a_guessed_focal_length_makes_depth_that_much_less_sure():
+def test_uncertain_focal_length_widens_the_depth_scale():
     """768 px for 517: the stated 15 % were 15 % with either."""
     fusion = MotionFusion(FusionConfig(), T_B_C, focal_sigma=0.45)
     for _ in range(50):
@@ -240,7 +240,7 @@ def test_a_guessed_focal_length_makes_depth_that_much_less_sure():
     assert 0.45 < scale.sigma / scale.value < 0.5
 
 
-def test_a_network_that_sees_no_depth_gives_no_metres_and_says_so():
+def test_network_out_of_domain_gives_no_scale_and_a_warning():
     fusion = MotionFusion(FusionConfig(), T_B_C)
     for _ in range(50):
         fusion.metres.add_depth_ratio(DepthRatio(math.log(3.0), 0.3, slope=0.0))
@@ -368,7 +368,7 @@ def test_height_changes_alone_tell_the_scale_of_a_climb(rng, replay, swinging):
     assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.04)
 
 
-def test_a_drone_that_only_turns_forgets_the_metres_of_its_climb(swinging, replay):
+def test_pure_rotation_discards_the_scale_of_a_climb(swinging, replay):
     """A quarter of a metre up in seven seconds, of which velocities tell nothing; then round on the spot: the map in
     view
     shares nothing any more with what the climb told. A drone that glances to the side keeps them."""
@@ -394,7 +394,7 @@ def test_a_drone_that_only_turns_forgets_the_metres_of_its_climb(swinging, repla
     assert told[3.0].sigma > 0.25, "three views away, each of a unit that is .15 another"
 
 
-def test_heights_that_hardly_change_tell_no_metres(swinging, replay):
+def test_small_height_changes_give_no_scale(swinging, replay):
     """A drone that hovers and glances about, and rises by 15 cm in ten seconds: so sensors and maps drift."""
     t = np.arange(0.0, 12.0, 0.05)
 
@@ -414,7 +414,7 @@ def test_heights_that_hardly_change_tell_no_metres(swinging, replay):
 
 @pytest.mark.parametrize(("source", "held"), [("height", False), ("telemetry+height", True)])
 @pytest.mark.parametrize("found", [None, (LogScale(0.1, 0.4, "height"), TelemetryFit())], ids=["nothing", "unsure"])
-def test_metres_by_heights_alone_are_not_held_when_heights_do_not_bear_them_out(source, held, found):
+def test_unconfirmed_scale_from_heights_is_withdrawn(source, held, found):
     trusting = SimpleNamespace(velocity=True, tells_scale=True, height=lambda reading: True, at_odds=None)
     metres = ScaleEstimator(FusionConfig(), 0.0)
     metres.take((LogScale(0.0, 0.1, source), TelemetryFit()), 0.0, trusting)

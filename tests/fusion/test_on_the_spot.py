@@ -71,7 +71,7 @@ def torn(rng):
 
 
 @pytest.mark.parametrize(("grow", "metric"), [(as_it_is, True), (by_views, True), (torn, False)])
-def test_what_is_stated_of_a_flight_on_the_spot_covers_the_truth(grow, metric):
+def test_stated_sigma_of_rotation_in_place_covers_the_truth(grow, metric):
     for seed in range(6):
         rng = np.random.default_rng(seed)
         T_w_c = turning(rng)
@@ -93,7 +93,7 @@ def test_velocities_in_another_unit_than_the_heights_are_not_explained_by_trunca
         assert any("contradict each other" in said for said in half.warnings())
 
 
-def test_truncated_velocities_tell_the_scale():
+def test_truncated_velocities_give_the_scale():
     for seed in range(3):
         rng = np.random.default_rng(seed)
         T_w_c = turning(rng, size_m=0.18)

@@ -32,7 +32,7 @@ def test_revision_leaves_the_present_camera_where_it_is(rng):
         (1.0, np.inf, "none"),
     ],
 )
-def test_what_is_not_measured_not_sure_or_no_news_revises_nothing(value, sigma, source):
+def test_unmeasured_uncertain_or_consistent_scales_do_not_revise(value, sigma, source):
     old = OutputFrame(2.0)
     assert old.revised(ScaleEstimate(value, sigma, source), np.ones(3)) is old
 
@@ -45,7 +45,7 @@ def test_what_is_not_measured_not_sure_or_no_news_revises_nothing(value, sigma, 
         (1.04, 0.03, False),  # more than a sigma, but hardly worth a revision
     ],
 )
-def test_the_unit_that_the_map_began_with_is_given_up_sooner_than_a_measured_one(value, sigma, given_up):
+def test_initial_unit_is_revised_sooner_than_a_measured_one(value, sigma, given_up):
     estimate = ScaleEstimate(value, sigma, "height+depth")
     assert (OutputFrame(1.0).revised(estimate, np.zeros(3)).revision == 1) == given_up
     measured = OutputFrame(1.0, revision=1, guessed=False)
@@ -66,7 +66,7 @@ def test_a_guess_may_follow_a_guess_until_metres_are_measured():
     assert measured.guessed_anew(guess, here) is measured
 
 
-def test_a_measured_unit_needs_a_surer_one_to_be_revised():
+def test_measured_unit_is_revised_only_by_a_more_accurate_one():
     estimate = ScaleEstimate(2.0, 0.24, "telemetry")
     assert OutputFrame(1.0).revised(estimate, np.zeros(3)).revision == 1
     measured = OutputFrame(1.0, revision=1, guessed=False)

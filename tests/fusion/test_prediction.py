@@ -43,7 +43,7 @@ def test_exact_telemetry_carries_the_camera_to_where_it_is(rng, swinging, gap_s)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_noisy_attitude_tells_the_delay_wherever_it_lies_between_packets(swinging, replay, seed):
+def test_noisy_attitude_gives_the_delay_for_any_packet_phase(swinging, replay, seed):
     """Half a degree of noise: an attitude between two packets has less, which must not draw the delay to it."""
     rng = np.random.default_rng(seed)
     motion = swinging(20.0)

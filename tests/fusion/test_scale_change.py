@@ -25,19 +25,19 @@ def steps(count=20, way=0.2, sigma=0.01):
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.0, 1.3])
-def test_it_is_the_size_of_what_is_remembered(factor):
+def test_scale_change_is_the_ratio_of_sizes(factor):
     before = steps()
     after = replace(before, moved=factor * before.moved)
     assert grown(before, after, 20.0) == pytest.approx(factor, rel=1e-12)
 
 
-def test_what_a_window_still_mends_says_nothing_of_the_unit():
+def test_recent_poses_do_not_affect_the_scale_change():
     before = steps()
     moved = before.moved * np.where(before.to_s > 15.0, 1.5, 1.02)[:, None]
     assert grown(before, replace(before, moved=moved), 20.0) == pytest.approx(1.02, rel=1e-12)
 
 
-def test_poses_that_were_mended_say_nothing_of_the_unit():
+def test_local_corrections_do_not_affect_the_scale_change():
     """A drone that hovers, two of whose few displacements are mended when pieces are joined, the longest by a third."""
     before = steps(16, way=0.03, sigma=0.002)
     before.moved[5, 0] = 0.045
@@ -47,12 +47,12 @@ def test_poses_that_were_mended_say_nothing_of_the_unit():
 
 
 @pytest.mark.parametrize("before", [steps(way=0.04), steps(count=8), steps(count=0)])
-def test_noise_and_a_young_map_tell_nothing(before):
+def test_noise_and_a_new_map_give_no_scale_change(before):
     assert grown(before, replace(before, moved=2.0 * before.moved), 8.0) == 1.0
 
 
 @pytest.mark.parametrize("factor", [0.0, np.nan, np.inf])
-def test_a_map_that_collapsed_tells_no_size(factor):
+def test_collapsed_map_gives_no_scale_change(factor):
     before = steps()
     assert grown(before, replace(before, moved=np.full_like(before.moved, factor)), 20.0) == 1.0
 

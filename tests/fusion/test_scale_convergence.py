@@ -33,24 +33,24 @@ def rescaled(by, within_s=0.5):
 
 
 @pytest.mark.parametrize("by", [1.1, 1 / 1.1])
-def test_a_map_that_was_rescaled_will_be_rescaled_again(by):
+def test_recent_rescaling_predicts_further_rescaling(by):
     assert rescaled(by).sigma == pytest.approx(AS_MUCH_AGAIN * math.log(1.1), rel=1e-6)
 
 
-def test_unrest_is_forgotten_within_seconds():
+def test_convergence_sigma_decays_within_seconds():
     convergence_sigma = rescaled(1.1)
     before = convergence_sigma.sigma
     convergence_sigma.compare(path(3.5), path(3.5), 3.5)
     assert convergence_sigma.sigma == pytest.approx(before * math.exp(-1.0))
 
 
-def test_changes_that_go_on_add_up():
+def test_repeated_changes_accumulate():
     convergence_sigma = rescaled(1.1)
     convergence_sigma.compare(path(3.0), path(3.0, 1.1), 3.0)
     assert convergence_sigma.sigma == pytest.approx(AS_MUCH_AGAIN * math.log(1.1) * (1.0 + math.exp(-0.5)))
 
 
-def test_what_is_tracked_since_says_nothing_of_the_map():
+def test_frames_since_the_comparison_are_ignored():
     """Only the frames after the last comparison change; and a first comparison has nothing to compare."""
     convergence_sigma = ScaleConvergence()
     convergence_sigma.compare(path(2.0), path(2.0, 1.3), 2.0)

@@ -47,7 +47,7 @@ def test_correlation_of_small_numbers_by_hand():
     assert agreement(seen, told, 0.0, 0.0).correlation == pytest.approx(16 / math.sqrt(10 * 36))
 
 
-def test_agreement_and_contradiction_must_both_be_proven():
+def test_agreement_and_contradiction_both_need_evidence():
     assert Agreement(0.99, 5).verdict is Verdict.OPEN
     assert Agreement(0.95, 6).verdict is Verdict.AGREES
     assert Agreement(0.80, 6).verdict is Verdict.OPEN
@@ -57,7 +57,7 @@ def test_agreement_and_contradiction_must_both_be_proven():
     assert Agreement(0.90, 12, dimensions=1).verdict is Verdict.OPEN  # one axis proves less
 
 
-def test_few_intervals_prove_velocities_only_where_they_agree_nearly_fully():
+def test_few_intervals_validate_velocities_only_at_high_correlation():
     assert Agreement(0.96, 4, early=True).verdict is Verdict.AGREES
     assert Agreement(0.94, 5, early=True).verdict is Verdict.OPEN
     assert Agreement(0.99, 3, early=True).verdict is Verdict.OPEN
@@ -90,7 +90,7 @@ def test_one_wild_reading_does_not_decide(rng):
     assert agreement(seen, told, 0.0, 0.0).verdict is Verdict.AGREES
 
 
-def test_changes_stay_within_a_stretch():
+def test_changes_stay_within_a_segment():
     stamps = np.arange(0.25, 4.0, 0.5)
     segment = np.array([0, 0, 0, 0, 1, 1, 1, 1])
     z = np.array([0.0, 1.0, 2.0, 3.0, 10.0, 10.5, 11.0, 11.5])[:, None]
@@ -98,7 +98,7 @@ def test_changes_stay_within_a_stretch():
     assert changes(z[:0], stamps[:0], segment[:0], 0.5).shape == (0, 1)
 
 
-def test_a_verdict_is_kept_until_the_opposite_is_proven():
+def test_verdict_is_kept_until_contradicted():
     trust = SensorGate()
     assert not trust.velocity
     trust.judge(Reading.VELOCITY, Agreement(0.95, 20))
@@ -371,7 +371,7 @@ def test_right_velocities_of_a_turning_drone_stay_as_they_are(rng, swinging, rep
     assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.06)
 
 
-def test_velocities_do_not_count_where_the_attitude_of_the_same_messages_contradicts():
+def test_velocities_are_unused_if_their_attitude_contradicts_the_images():
     trust = SensorGate()
     trust.judge(Reading.VELOCITY, Agreement(0.95, 12))
     assert trust.velocity
@@ -380,7 +380,7 @@ def test_velocities_do_not_count_where_the_attitude_of_the_same_messages_contrad
     assert any("velocities are not used" in w for w in trust.warnings())
 
 
-def test_velocities_that_agree_and_tell_no_scale_are_said():
+def test_validated_velocities_without_a_scale_are_reported():
     trust = SensorGate()
     trust.judge(Reading.VELOCITY, Agreement(0.8, 12))
     assert trust.warnings() == []
@@ -392,7 +392,7 @@ def test_velocities_that_agree_and_tell_no_scale_are_said():
     ("by_height", "correlation", "count", "nonsense"),
     [(0.34, 0.7, 5, True), (2.2, 0.7, 5, False), (0.34, 0.4, 5, False), (0.34, 0.7, 3, False)],
 )
-def test_a_height_may_be_nonsense_beside_velocities_that_prove_nothing(by_height, correlation, count, nonsense):
+def test_height_scale_is_rejected_by_the_ratio_of_path_lengths(by_height, correlation, count, nonsense):
     """By the length of the way, three metres a unit; the height of a map whose first second is wrong says a tenth."""
     scale = TelemetryScale.__new__(TelemetryScale)
     scale._trust, scale._shown = SensorGate(), SimpleNamespace(start=3.0)
@@ -453,7 +453,7 @@ def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, repla
         ("telemetry+height", 0.1, None, False),
     ],
 )
-def test_velocities_pull_at_the_map_where_they_go_with_metres_that_are_known(source, sigma, kept, speaks):
+def test_velocities_constrain_the_map_only_with_a_consistent_scale(source, sigma, kept, speaks):
     """A young map's heights may tell a unit several times off at a quarter, and velocities would tear it by that."""
     fusion = MotionFusion(FusionConfig(), T_B_C)
     fusion.orientation.found = Turned(np.eye(3), np.eye(3), np.zeros(3))
@@ -464,7 +464,7 @@ def test_velocities_pull_at_the_map_where_they_go_with_metres_that_are_known(sou
     assert fusion.telemetry().standing is (kept in ("", "telemetry")), "that it stands is right in any unit"
 
 
-def test_gravity_speaks_before_metres_are_known_if_the_map_began_upright():
+def test_gravity_constrains_an_upright_map_before_the_scale_is_known():
     fusion = MotionFusion(FusionConfig(), T_B_C)
     assert fusion.telemetry() is None, "nothing says where up is"
     fusion.orientation.began_upright = True

@@ -19,7 +19,7 @@ def values(readings: Readings) -> dict[str, np.ndarray]:
     return {field.name: getattr(readings, field.name) for field in fields(Readings)}
 
 
-def test_readings_are_the_samples_however_they_came() -> None:
+def test_readings_do_not_depend_on_the_batching_of_samples() -> None:
     """More than the first array holds, asked for in between or not."""
     samples = [sample(np.random.default_rng(k), k) for k in range(700)]
     at_once, one_by_one = (TelemetryTrack("world", 0.35) for _ in range(2))
@@ -33,7 +33,7 @@ def test_readings_are_the_samples_however_they_came() -> None:
         np.testing.assert_array_equal(values(at_once.readings)[name], [getattr(s, field) for s in samples])
 
 
-def test_what_is_older_than_is_kept_goes() -> None:
+def test_samples_beyond_the_buffer_are_dropped() -> None:
     track = TelemetryTrack("world", 0.35, keep_s=30.0)
     samples = [sample(np.random.default_rng(k), k) for k in range(700)]
     for one in samples:
@@ -44,7 +44,7 @@ def test_what_is_older_than_is_kept_goes() -> None:
 
 
 @pytest.mark.parametrize("turn", Turn)
-def test_a_copy_reads_as_its_original_and_does_not_grow_with_it(turn: Turn) -> None:
+def test_copy_is_equal_and_independent(turn: Turn) -> None:
     track = TelemetryTrack("world", 0.35)
     samples = [sample(np.random.default_rng(k), k) for k in range(206)]
     track.add(samples[:200])

@@ -47,7 +47,7 @@ def test_a_truncated_flight_loses_half_a_step_on_average(unit):
     np.testing.assert_allclose(lost[1] - lost[0], [4.0 * 0.05, 0.0, 0.0], atol=0.008)
 
 
-def test_where_the_images_were_blind_nothing_is_added():
+def test_no_remainder_without_vision():
     track, seen = along_x(0.72, 1.0)
     there = (seen.stamps_s < 2.0) | (seen.stamps_s > 4.0)
     cut = Sightings(seen.stamps_s[there], seen.T[there], seen.sigma_t[there])
@@ -73,7 +73,7 @@ def test_a_flight_below_one_step_confirms_any_scale(speed_m_s, low, high):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rounding", list(Rounding))
-def test_slow_flights_are_as_sure_as_they_may_be(swinging, replay, rounding):
+def test_slow_flights_have_calibrated_sigma(swinging, replay, rounding):
     """Speeds of one to two steps: five draws of telemetry, each inside its own three sigmas."""
     for seed in range(5):
         rng = np.random.default_rng(seed)

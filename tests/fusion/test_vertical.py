@@ -32,28 +32,28 @@ def test_a_nose_that_is_down_sees_up_behind_and_above():
     assert doubt_rad == pytest.approx(0.0, abs=1e-12)
 
 
-def test_it_is_of_the_moment_that_the_image_shows():
+def test_vertical_compensates_the_video_delay():
     pitch = np.where(np.arange(30) < 10, 0.0, math.radians(10.0))
     before, after = (told(pitch, delay_s=delay_s).vertical(1.2)[0] for delay_s in (0.5, 0.0))
     assert before[2] == pytest.approx(0.0, abs=1e-9) and after[2] < -0.17
 
 
-def test_a_map_that_began_askew_is_not_asked():
+def test_no_vertical_for_a_map_that_began_tilted():
     assert told(0.0, upright=False).vertical(1.0) is None
 
 
-def test_a_moment_without_telemetry_says_nothing():
+def test_no_vertical_without_telemetry():
     assert told(0.0).vertical(9.0) is None
 
 
-def test_where_it_leans_as_a_hand_does_it_is_asked_once_it_has_turned_with_the_images():
+def test_strong_lean_needs_validated_attitude_for_the_vertical():
     fusion = told(np.where(np.arange(30) < 20, 0.0, math.radians(20.0)))
     assert fusion.vertical(1.0) is None
     fusion.flight.trust.judge(Reading.ATTITUDE, Agreement(0.99, 30))
     assert fusion.vertical(1.0)[1] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_it_is_as_unsure_as_the_moment_of_the_image():
+def test_vertical_error_covers_delay_uncertainty():
     fusion = told(np.radians(np.clip(20.0 * (0.1 * np.arange(30) - 1.0), 0.0, 10.0)), delay_s=None)
     late_s = min(fusion.flight.delay_sigma_s, DELAY_S)
     leaned = fusion.vertical(1.25 + fusion.delay_s)[1]

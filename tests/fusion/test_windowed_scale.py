@@ -17,13 +17,13 @@ def flown(count=4, speed=0.5, metres_per_unit=2.0, noise=0.0, seed=0):
     return moved_m / metres_per_unit, moved_m, np.ones(count)
 
 
-def test_it_is_the_way_told_over_the_way_seen():
+def test_windowed_scale_is_the_ratio_of_displacements():
     found = present_scale(*flown(metres_per_unit=2.0), 0.1)
     assert math.exp(found.log_scale) == pytest.approx(2.0)
     assert found.sigma == pytest.approx(math.hypot(0.05, 0.4 * 0.1 / 0.5))
 
 
-def test_its_sigma_covers_velocities_in_whole_steps():
+def test_windowed_sigma_covers_quantisation():
     """Truncated to a decimetre a second, at speeds from .3 to .8 m/s: within two sigmas in 95 %."""
     rng = np.random.default_rng(1)
     inside = []
@@ -37,30 +37,30 @@ def test_its_sigma_covers_velocities_in_whole_steps():
     assert np.mean(inside) > 0.95
 
 
-def test_a_short_way_tells_nothing():
+def test_short_displacement_gives_no_scale():
     assert present_scale(*flown(count=2), 0.1) is None
     assert present_scale(*flown(speed=0.1), 0.1) is None
 
 
-def test_ways_in_two_directions_tell_nothing():
+def test_inconsistent_directions_give_no_scale():
     seen, told, duration = flown()
     assert present_scale(seen[:, [1, 0, 2]], told, duration, 0.1) is None
     assert present_scale(-seen, told, duration, 0.1) is None
 
 
-def test_only_what_leaves_no_room_counts():
+def test_only_contradictions_count_as_scale_change():
     before = LogScale(0.0, 0.03, "height")
     assert at_odds(LogScale(math.log(4.0), 0.1, "telemetry"), before)
     assert not at_odds(LogScale(math.log(1.4), 0.01, "telemetry"), before)  # a usual drift
     assert not at_odds(LogScale(math.log(1.7), 0.2, "telemetry"), before)  # not sure
 
 
-def test_it_is_said_with_both_scales():
+def test_warning_names_both_scales():
     said = Parted(LogScale(math.log(2.0), 0.1, "telemetry"), LogScale(math.log(0.5), 0.03, "height")).warning()
     assert "2 metres per unit" in said and "0.5 by the flight before" in said
 
 
-def test_a_wrong_unit_is_no_change():
+def test_wrong_unit_is_no_scale_change():
     now = present_scale(*flown(metres_per_unit=2.0), 0.1)
     seen, told, _ = flown(count=10, metres_per_unit=2.0)
     assert not has_changed(now, seen, told)
