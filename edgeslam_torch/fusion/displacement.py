@@ -112,7 +112,7 @@ class _Rows:
 
 @dataclass(frozen=True, slots=True)
 class TelemetryModel:
-    """Telemetry at one moment, and its alignment with the map."""
+    """Telemetry at one time, and its alignment with the map."""
 
     track: TelemetryTrack
     config: FusionConfig
@@ -124,7 +124,7 @@ class TelemetryModel:
     scale: float
     """Metres per map unit."""
     scale_sigma_log: float
-    """Infinite where only gravity is known."""
+    """Infinite if only gravity is available."""
     velocity: bool
     """Whether velocities are usable."""
     height: str | None
@@ -134,7 +134,7 @@ class TelemetryModel:
     attitude: bool = True
     """Whether attitude is usable."""
     young: bool = False
-    """Whether the map began seconds ago."""
+    """Whether the map is only seconds old."""
     standing: bool = False
     """Whether zero readings are usable although velocities are not: zero is independent of the scale."""
 

@@ -42,8 +42,8 @@ class ScaleEstimator:
         self.sensor_scale: LogScale | None = None
         """Scale by the drone's own sensors; unchanged without new measurements."""
         self.guess: ScaleEstimate | None = None
-        """Scale by a climb before telemetry is validated; None afterwards. Not metric: only a better guess of the
-        published scale than the depth network's."""
+        """Scale by a climb before telemetry is validated; None afterwards. Not metric: only a better initial value of
+        the published scale than the depth network's."""
         self._remembered: LogScale | None = None
         self._scale = ScaleEstimate()
         self._rests_on: tuple[LogScale | None, LogScale | None, DepthScale | None] = (None, None, None)
@@ -63,7 +63,7 @@ class ScaleEstimator:
     def remember(self, scale: ScaleEstimate | None) -> None:
         """Metres per unit of the camera's submap from an earlier flight; None for a new submap.
 
-        They replace the depth network's estimate, whose error in a place is the same in every flight.
+        It replaces the depth network's estimate, whose error in a place is the same in every flight.
         """
         if scale is None or not math.isfinite(scale.sigma):
             self._remembered = None

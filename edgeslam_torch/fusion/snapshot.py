@@ -1,4 +1,4 @@
-"""The camera at the present moment, from immutable records that other threads may use."""
+"""Current camera pose from immutable records, safe to use in other threads."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ _LONGEST_STEP_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """State of the fusion at one moment."""
+    """State of the fusion at one time."""
 
     last: VisualPose
     """Newest tracked frame."""
@@ -40,7 +40,7 @@ class Present:
     """None before the first frame."""
 
     def pose_at(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> PoseNow | None:
-        """The camera at a moment; ``None`` before the first tracked frame.
+        """Camera pose at a stamp; ``None`` before the first tracked frame.
 
         Args:
             stamp_s: No earlier than the newest state message.

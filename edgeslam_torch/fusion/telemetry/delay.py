@@ -88,7 +88,7 @@ class DelaySearch:
         """Negative log-likelihood of the rotations with the residuals' own variance.
 
         An interpolated attitude is less noisy than a reading. Without a correction the best delay is one that puts all
-        intervals between readings, a bias of up to 0.04 s at 10 Hz.
+        intervals between readings, a bias of 0.04 s at 10 Hz.
         """
         both = turns(moved, track, self._R_b_c)
         trace = np.einsum("nij,nij->n", both.seen, both.told)

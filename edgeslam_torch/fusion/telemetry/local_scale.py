@@ -1,4 +1,4 @@
-"""Metres per map unit around one moment of the flight, from the seconds before and after it.
+"""Metres per map unit around one time of the flight, from the seconds before and after it.
 
 The scale of a whole flight (`fusion/telemetry_scale.py`) is that of the present map. A monocular map drifts in scale,
 so that two places in it may differ; local velocities measure the difference.
