@@ -73,7 +73,7 @@ class Pieces:
         return np.linalg.norm(sim3.transform(sim3.fit(found, truth), found) - truth, axis=1).max()
 
 
-def test_two_pieces_of_one_place_become_one(rng):
+def test_submaps_of_one_place_are_merged(rng):
     pieces = Pieces(rng)
     assert pieces.position_error() > 0.2
     join = pieces.atlas().update()
@@ -88,7 +88,7 @@ def test_two_pieces_of_one_place_become_one(rng):
     assert pieces.log.support().piece.tolist() == [0] * 8
 
 
-def test_a_piece_is_asked_again_only_by_new_keyframes(rng):
+def test_only_new_keyframes_are_compared_again_with_a_submap(rng):
     pieces = Pieces(rng)
     atlas = pieces.atlas()
     assert not atlas.is_up_to_date
@@ -100,7 +100,7 @@ def test_a_piece_is_asked_again_only_by_new_keyframes(rng):
     assert len(atlas.joins) == 1
 
 
-def test_keyframes_are_asked_again_one_at_a_time_the_newest_first(rng, monkeypatch):
+def test_keyframes_are_compared_again_one_at_a_time_newest_first(rng, monkeypatch):
     """Not all at once, which would stop the video for a second."""
     pieces = Pieces(rng)
     atlas, asked = pieces.atlas(), []
@@ -114,7 +114,7 @@ def test_keyframes_are_asked_again_one_at_a_time_the_newest_first(rng, monkeypat
     assert not atlas.is_up_to_date
 
 
-def test_what_was_missed_at_first_is_joined_when_asked_again(rng):
+def test_a_missed_link_is_found_by_a_later_comparison(rng):
     pieces = Pieces(rng)
     atlas = pieces.atlas()
     atlas._searched = 7  # as if each had been asked before the other piece had grown
@@ -125,7 +125,7 @@ def test_what_was_missed_at_first_is_joined_when_asked_again(rng):
     assert atlas.is_up_to_date
 
 
-def test_two_places_stay_two_pieces(rng):
+def test_submaps_of_different_places_are_not_merged(rng):
     pieces = Pieces(rng, same_place=False)
     before = [k.T_c_w.copy() for k in pieces.keyframes]
     assert pieces.atlas().update() is None
@@ -134,7 +134,7 @@ def test_two_places_stay_two_pieces(rng):
         np.testing.assert_array_equal(keyframe.T_c_w, T_c_w)
 
 
-def test_one_keyframe_alone_joins_nothing(rng):
+def test_a_single_keyframe_does_not_merge_submaps(rng):
     pieces = Pieces(rng)
     for keyframe in pieces.keyframes[5:]:
         pieces.map.forget_observations(keyframe, keyframe.keypoints_with_anchor())
@@ -142,7 +142,7 @@ def test_one_keyframe_alone_joins_nothing(rng):
     assert pieces.map.piece_of(pieces.keyframes[4].id) == 1
 
 
-def test_links_that_disagree_join_nothing(rng):
+def test_inconsistent_links_do_not_merge_submaps(rng):
     """Half of the second piece has come apart from the other half: no two links say the same."""
     pieces = Pieces(rng)
     anchors = pieces.map.anchors
@@ -160,7 +160,7 @@ def test_links_that_disagree_join_nothing(rng):
     assert pieces.atlas().update() is None
 
 
-def test_link_tells_the_similarity(rng):
+def test_a_link_gives_the_similarity(rng):
     pieces = Pieces(rng)
     found = link(pieces.tracker, pieces.keyframes[4], pieces.keyframes[3])
     error = sim3.log(found.S @ MISPLACED)
@@ -171,7 +171,7 @@ def test_link_tells_the_similarity(rng):
     assert found.agrees(link(pieces.tracker, pieces.keyframes[5], pieces.keyframes[3]))
 
 
-def test_depths_that_do_not_agree_are_no_scale(rng):
+def test_inconsistent_depths_give_no_scale(rng):
     """The same pictures on a wall that stands elsewhere in every direction: a pose fits, the depths do not."""
     pieces = Pieces(rng)
     keyframe = pieces.keyframes[4]
@@ -184,7 +184,7 @@ def test_depths_that_do_not_agree_are_no_scale(rng):
     assert common_scale(pieces.tracker, keyframe, track) is None
 
 
-def test_lookalikes_are_the_keyframes_that_see_the_same(rng):
+def test_candidates_are_the_keyframes_of_the_same_view(rng):
     pieces = Pieces(rng)
     found = revisit_candidates(pieces.map, pieces.keyframes[4].words, pieces.keyframes[:4], 3)
     assert len(found) == 3
@@ -194,7 +194,7 @@ def test_lookalikes_are_the_keyframes_that_see_the_same(rng):
     assert revisit_candidates(pieces.map, stranger, [], 3) == []
 
 
-def test_moving_a_piece_changes_nothing_that_its_cameras_see(rng):
+def test_transforming_a_submap_preserves_its_projections(rng):
     pieces = Pieces(rng)
     slam_map, anchors = pieces.map, pieces.map.anchors
     first, last = pieces.keyframes[0], pieces.keyframes[7]
@@ -233,7 +233,7 @@ def test_moving_a_piece_changes_nothing_that_its_cameras_see(rng):
 
 
 @pytest.mark.parametrize("smaller", [0, 1])
-def test_the_smaller_piece_comes_to_the_larger(rng, smaller):
+def test_the_smaller_submap_is_transformed_to_the_larger(rng, smaller):
     pieces = Pieces(rng)
     there = {k.id: centre for k, centre in zip(pieces.keyframes, se3.inverse(pieces.points.world.T_c_w), strict=True)}
     for keyframe in pieces.keyframes[:2] if smaller == 0 else pieces.keyframes[6:]:
@@ -249,7 +249,7 @@ def test_the_smaller_piece_comes_to_the_larger(rng, smaller):
     np.testing.assert_allclose(after, sim3.transform(to_larger, truth), atol=0.03)
 
 
-def test_a_camera_that_stands_is_one_witness(rng):
+def test_a_static_camera_gives_one_link(rng):
     """The same image twice proves no more than once."""
     pieces = Pieces(rng)
     slam_map, anchors, atlas = pieces.map, pieces.map.anchors, pieces.atlas()
@@ -271,7 +271,7 @@ def test_a_camera_that_stands_is_one_witness(rng):
     assert atlas.update() is None
 
 
-def test_a_plane_is_told_from_a_corner_whatever_its_place_and_size(rng):
+def test_planarity_is_invariant_to_position_and_size(rng):
     """A floor known to 5 mm, in metres and in kilometres; a twelfth of it wrong; a floor and a wall; a bent floor."""
     floor = np.column_stack([rng.uniform(-1, 1, (240, 2)), rng.normal(0, 0.005, 240)])
     wrong = floor + np.where(np.arange(240) % 12 == 0, 0.5, 0.0)[:, None]
@@ -284,7 +284,7 @@ def test_a_plane_is_told_from_a_corner_whatever_its_place_and_size(rng):
 
 
 @pytest.mark.parametrize(("share", "believed"), [(0.15, False), (0.25, True)])
-def test_one_plane_is_a_place_only_when_much_of_it_is_found(rng, monkeypatch, share, believed):
+def test_a_planar_place_needs_a_larger_share_of_matches(rng, monkeypatch, share, believed):
     pieces = Pieces(rng)
     place = links._place
     monkeypatch.setattr(links, "_place", lambda *args: replace(place(*args), share=share))
@@ -294,7 +294,7 @@ def test_one_plane_is_a_place_only_when_much_of_it_is_found(rng, monkeypatch, sh
 
 
 @pytest.mark.parametrize("guessed_there", [False, True])
-def test_guessed_depths_tell_no_scale(rng, guessed_there):
+def test_predicted_depths_give_no_scale(rng, guessed_there):
     pieces = Pieces(rng)
     keyframe, anchors = pieces.keyframes[4], pieces.map.anchors
     track = match_keyframe(pieces.tracker, view_of(keyframe, SCALE_FACTOR), pieces.keyframes[3])
@@ -327,7 +327,7 @@ def metres_along(second):
     return told
 
 
-def test_where_images_tell_no_scale_the_drones_own_sensors_do(rng):
+def test_sensors_give_the_scale_if_images_do_not(rng):
     pieces = turning(rng, CARRIED)
     keyframe, other = pieces.keyframes[4], pieces.keyframes[3]
     assert link(pieces.tracker, keyframe, other) is None
@@ -338,7 +338,7 @@ def test_where_images_tell_no_scale_the_drones_own_sensors_do(rng):
     assert link(pieces.tracker, keyframe, other, scale_between=lambda *_: None) is None
 
 
-def test_wallpaper_is_no_place_whose_scale_is_told(rng, monkeypatch):
+def test_wallpaper_gives_no_scale(rng, monkeypatch):
     pieces = turning(rng, CARRIED)
     place = links._place
     monkeypatch.setattr(links, "_place", lambda *args: replace(place(*args), share=0.16))
@@ -349,7 +349,7 @@ def test_wallpaper_is_no_place_whose_scale_is_told(rng, monkeypatch):
     )
 
 
-def test_a_drone_that_turned_on_the_spot_joins_the_map_of_its_take_off(rng):
+def test_a_submap_of_a_rotation_is_merged_with_the_first_one(rng):
     assert turning(rng, CARRIED).atlas().update() is None
     pieces = turning(rng, CARRIED)
     assert pieces.atlas(metres_along=metres_along(2.0 / 1.06)).update() is None, "nothing says where it began"
@@ -362,7 +362,7 @@ def test_a_drone_that_turned_on_the_spot_joins_the_map_of_its_take_off(rng):
 
 
 @pytest.mark.parametrize("by_sensors", [True, False])
-def test_what_the_older_piece_has_drifted_by_is_spread_over_it(rng, by_sensors):
+def test_drift_of_the_older_submap_is_distributed_over_it(rng, by_sensors):
     """The newer one began where the drone's sensors had carried it: a step between them would be torn by telemetry."""
     pieces = Pieces(rng, misplaced=CARRIED)
     join = pieces.atlas(start_sigma=lambda piece: 0.01 if by_sensors and piece == 1 else np.inf).update()
@@ -371,7 +371,7 @@ def test_what_the_older_piece_has_drifted_by_is_spread_over_it(rng, by_sensors):
     assert join.growth(join.moved, 7) == pytest.approx(sim3.scale_of(join.S) * join.scale_change.get(7, 1.0))
 
 
-def test_a_bridge_is_between_the_last_keyframe_and_the_first_after_it(rng):
+def test_a_bridge_connects_consecutive_keyframes_of_two_submaps(rng):
     pieces = Pieces(rng, misplaced=CARRIED)
     found = bridge(pieces.map, 1, 0)
     assert (found.newer, found.older) == (4, 3)
@@ -381,7 +381,7 @@ def test_a_bridge_is_between_the_last_keyframe_and_the_first_after_it(rng):
     np.testing.assert_allclose(found.scaled(2.0).T[:3, :3], found.T[:3, :3])
 
 
-def test_a_piece_is_brought_to_the_unit_of_the_first_one(rng):
+def test_a_submap_is_scaled_to_the_unit_of_the_first_one(rng):
     """Anchors, keyframes and frames, about where it began; what its cameras see stays the same."""
     pieces = Pieces(rng, misplaced=CARRIED)
     before = [k.centre_w for k in pieces.keyframes]
@@ -400,7 +400,7 @@ def test_a_piece_is_brought_to_the_unit_of_the_first_one(rng):
 
 
 @pytest.mark.parametrize("along", [2.0 * 1.02, None])
-def test_what_the_drone_tells_as_it_flies_counts_where_velocities_along_a_piece_tell_nothing_else(rng, along):
+def test_the_scale_in_flight_is_used_if_velocities_of_a_submap_give_none(rng, along):
     """A drone that climbs on the spot in its piece: heights alone tell the unit."""
 
     def told(stamps_s, T_w_c):
@@ -423,7 +423,7 @@ def test_what_the_drone_tells_as_it_flies_counts_where_velocities_along_a_piece_
         (None, 0.02, "nothing tells"),
     ],
 )
-def test_a_piece_keeps_its_unit_where_nothing_is_surely_wrong(rng, second, sigma, why):
+def test_a_submap_keeps_its_scale_without_a_significant_error(rng, second, sigma, why):
     def told(stamps_s, T_w_c):
         first = stamps_s[0] == 0.0
         if not first and second is None:
@@ -438,7 +438,7 @@ def test_a_piece_keeps_its_unit_where_nothing_is_surely_wrong(rng, second, sigma
         np.testing.assert_array_equal(keyframe.T_c_w, T_c_w)
 
 
-def test_the_first_piece_and_that_of_an_earlier_flight_keep_their_unit(rng):
+def test_the_first_submap_and_a_loaded_one_keep_their_scale(rng):
     pieces = Pieces(rng, misplaced=CARRIED)
     atlas = pieces.atlas(metres_along=metres_along(3.0))
     atlas.known_scale[1] = ScaleEstimate(1.0, 0.02, "atlas")
@@ -461,7 +461,7 @@ def facing_along(second_rad, sigma_rad=0.05):
 
 
 @pytest.mark.parametrize("angle", [0.4, -0.7])
-def test_a_piece_is_turned_as_the_first_one(rng, angle):
+def test_a_submap_is_rotated_to_the_axes_of_the_first_one(rng, angle):
     """About where it began and about the vertical; what its cameras see stays the same."""
     pieces = Pieces(rng, misplaced=CARRIED)
     before = [k.T_c_w for k in pieces.keyframes]
@@ -487,7 +487,7 @@ def test_a_piece_is_turned_as_the_first_one(rng, angle):
 
 
 @pytest.mark.parametrize(("angle", "sigma"), [(0.2, 0.05), (0.0, 0.001)])
-def test_a_piece_stays_turned_as_it_is_where_nothing_is_surely_wrong(rng, angle, sigma):
+def test_a_submap_keeps_its_heading_without_a_significant_error(rng, angle, sigma):
     """0.2 rad are within three of both sigmas together."""
     pieces = Pieces(rng, misplaced=CARRIED)
     assert pieces.atlas(facing_along=facing_along(angle, sigma)[1]).align(1.0) is None
@@ -498,7 +498,7 @@ def pixels_of(pieces, keyframe):
     return CAMERA.project(se3.transform(keyframe.T_c_w, pieces.map.anchors.p_w[keyframe.anchor[held]]))
 
 
-def test_a_piece_is_not_joined_where_the_drone_cannot_have_come_to(rng):
+def test_an_unreachable_submap_is_not_merged(rng):
     """Half a metre and forty degrees off after a way of centimetres: nothing drifts so, however much it looks alike."""
     told = metres_along(2.0 / 1.4)
     assert turning(rng, MISPLACED).atlas(metres_along=told, start_sigma=lambda _: 0.01).update() is None
@@ -506,7 +506,7 @@ def test_a_piece_is_not_joined_where_the_drone_cannot_have_come_to(rng):
     assert Pieces(rng, misplaced=MISPLACED).atlas().update() is not None, "by images alone"
 
 
-def test_where_a_piece_of_an_earlier_flight_lies_no_sensor_tells(rng):
+def test_sensors_do_not_relate_a_loaded_submap(rng):
     pieces = Pieces(rng, misplaced=MISPLACED)
     for keyframe in pieces.keyframes[:4]:
         keyframe.stamp_s = BEFORE_S
@@ -514,14 +514,14 @@ def test_where_a_piece_of_an_earlier_flight_lies_no_sensor_tells(rng):
 
 
 @pytest.mark.parametrize(("sigma", "may"), [(0.1, False), (0.4, True)])
-def test_what_the_sensors_leave_open_may_be_made_up_for(rng, sigma, may):
+def test_a_correction_within_sensor_uncertainty_is_accepted(rng, sigma, may):
     """More than a metre beside where it was carried to."""
     beside = sim3.exp(np.array([1.3, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
     join = Pieces(rng, misplaced=beside).atlas(start_sigma=lambda _: sigma).update()
     assert (join is not None) == may
 
 
-def test_the_way_back_must_close(rng):
+def test_the_link_must_agree_in_both_directions(rng):
     """Ten degrees of roll between a keyframe and its own anchors: all depths agree, the poses do not."""
     pieces = Pieces(rng)
     keyframe, other = pieces.keyframes[4], pieces.keyframes[3]
@@ -530,7 +530,7 @@ def test_the_way_back_must_close(rng):
     assert link(pieces.tracker, keyframe, other) is None
 
 
-def test_moved_anchors_are_searched_as_before(rng):
+def test_transformed_anchors_are_still_matched(rng):
     """Where an anchor may be seen from is told relative to its distance, and so is what is known of its depth."""
     pieces = Pieces(rng)
     anchors, last = pieces.map.anchors, pieces.keyframes[7]
@@ -549,7 +549,7 @@ def test_moved_anchors_are_searched_as_before(rng):
 
 
 @pytest.mark.parametrize("known", [0, 1])
-def test_the_map_of_an_earlier_flight_stays_and_keeps_its_metres(rng, known):
+def test_a_loaded_map_keeps_its_pose_and_scale(rng, known):
     """However small it is beside the flight's own piece."""
     pieces = Pieces(rng)
     for keyframe in pieces.keyframes[:2] if known == 0 else pieces.keyframes[6:]:
@@ -571,7 +571,7 @@ def warped(pieces, bend):
     return link(pieces.tracker, pieces.keyframes[4], pieces.keyframes[3])
 
 
-def test_the_sigma_of_a_join_knows_how_the_maps_bend(rng):
+def test_the_sigma_of_a_merge_includes_map_deformation(rng):
     straight, bent = warped(Pieces(rng), 0.0), warped(Pieces(rng), 0.15)
     assert straight.bend_log < 0.005
     assert bent.bend_log > 0.02 > 2.0 * bent.sigma_log
@@ -580,7 +580,7 @@ def test_the_sigma_of_a_join_knows_how_the_maps_bend(rng):
     assert _sigma_log(bent, [bent, other]) > 0.05
 
 
-def test_one_image_stored_twice_in_the_other_piece_is_one_witness(rng):
+def test_a_duplicate_image_in_the_other_submap_gives_one_link(rng):
     pieces = Pieces(rng)
     one, other = (link(pieces.tracker, k, pieces.keyframes[3]) for k in pieces.keyframes[4:6])
     stored = pieces.keyframes[3]

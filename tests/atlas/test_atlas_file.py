@@ -71,7 +71,7 @@ def restored(saved, camera=CAMERA):
     return slam_map, edges
 
 
-def test_a_saved_map_shows_the_same_in_published_units(rng, tmp_path):
+def test_a_saved_map_is_the_same_in_output_units(rng, tmp_path):
     flown = Flown(rng)
     write_atlas(tmp_path / "room.atlas", flown.saved(Unit(S, KNOWN)))
     saved = read_atlas(tmp_path / "room.atlas")
@@ -99,7 +99,7 @@ def test_a_saved_map_shows_the_same_in_published_units(rng, tmp_path):
 
 
 @pytest.mark.parametrize("far", [1.2e7, np.inf, np.nan])
-def test_an_anchor_that_ran_away_is_left_out(rng, tmp_path, far):
+def test_a_diverged_anchor_is_omitted(rng, tmp_path, far):
     """One keypoint without parallax, 12 000 km off after the last refinement, made a file that could not be read."""
     flown = Flown(rng)
     held = flown.map.latest().anchor
@@ -112,7 +112,7 @@ def test_an_anchor_that_ran_away_is_left_out(rng, tmp_path, far):
     assert len(restored(saved)[0].anchors) == whole - 1
 
 
-def test_edges_of_removed_keyframes_come_along(rng, tmp_path):
+def test_edges_of_removed_keyframes_are_saved(rng, tmp_path):
     flown = Flown(rng)
     write_atlas(tmp_path / "room.atlas", flown.saved(Unit(S, KNOWN)))
     _, edges = restored(read_atlas(tmp_path / "room.atlas"))
@@ -126,7 +126,7 @@ def test_edges_of_removed_keyframes_come_along(rng, tmp_path):
     assert edges.hosts[0].observations.tolist() == [3] * 7
 
 
-def test_a_map_may_be_saved_and_read_again_and_again(rng, tmp_path):
+def test_repeated_saving_and_loading_preserves_the_map(rng, tmp_path):
     path = tmp_path / "room.atlas"
     write_atlas(path, Flown(rng).saved(Unit(np.eye(4), KNOWN)))
     first = path.read_bytes()
@@ -136,7 +136,7 @@ def test_a_map_may_be_saved_and_read_again_and_again(rng, tmp_path):
     assert path.read_bytes() == first
 
 
-def test_pieces_stay_apart_and_units_belong_to_one(rng, tmp_path):
+def test_submaps_stay_separate_and_have_their_own_units(rng, tmp_path):
     flown = Flown(rng)
     other = Flown(np.random.default_rng(5)).saved()
     unpack_into = flown.map.add_piece("second")
@@ -167,7 +167,7 @@ def test_pixels_are_those_of_the_new_camera(rng):
         ({"fy": 200.0}, "made with another camera"),
     ],
 )
-def test_an_atlas_of_another_lens_is_refused(rng, tmp_path, change, match):
+def test_an_atlas_of_another_lens_is_rejected(rng, tmp_path, change, match):
     saved = Flown(rng).saved()
     check_fits(saved, replace(CAMERA, fx=330.0), SCALE_FACTOR, tmp_path)
     with pytest.raises(AtlasError, match=match):
@@ -176,7 +176,7 @@ def test_an_atlas_of_another_lens_is_refused(rng, tmp_path, change, match):
         check_fits(saved, CAMERA, 1.5, tmp_path)
 
 
-def test_an_atlas_of_more_levels_is_refused_with_the_remedy(rng, tmp_path):
+def test_an_atlas_with_more_pyramid_levels_is_rejected_with_a_remedy(rng, tmp_path):
     saved = Flown(rng).saved()
     used = int(saved.arrays["keypoint.octave"].max()) + 1
     check_fits(saved, CAMERA, SCALE_FACTOR, tmp_path, used)
@@ -185,7 +185,7 @@ def test_an_atlas_of_more_levels_is_refused_with_the_remedy(rng, tmp_path):
 
 
 @pytest.mark.parametrize(("metres", "sigma"), [(1.0, 1e-9), (1000.0, 1e-9), (1000.0, 20.0), (1e-4, 1e-5)])
-def test_metres_that_nobody_could_have_measured_are_refused(rng, tmp_path, metres, sigma):
+def test_implausible_scales_are_rejected(rng, tmp_path, metres, sigma):
     saved = Flown(rng).saved()
     scale = tuple(ScaleEstimate(metres, sigma, "depth") for _ in saved.scale)
     write_atlas(tmp_path / "a.safetensors", replace(saved, scale=scale))
@@ -203,7 +203,7 @@ def refused(path, match="."):
     assert text.startswith(f"{path}: ") and "\n" not in text and len(text) < 500
 
 
-def test_what_is_no_atlas_is_refused(tmp_path):
+def test_other_files_are_rejected(tmp_path):
     refused(tmp_path / "none", "no such atlas file")
     refused(tmp_path, "no such atlas file")
     (tmp_path / "text").write_text("an atlas")
@@ -213,7 +213,7 @@ def test_what_is_no_atlas_is_refused(tmp_path):
     assert not any(is_atlas(tmp_path / name) for name in ("text", "weights", "none"))
 
 
-def test_every_truncated_file_is_refused(rng, tmp_path):
+def test_every_truncated_file_is_rejected(rng, tmp_path):
     path = tmp_path / "room.atlas"
     write_atlas(path, Flown(rng).saved())
     whole = path.read_bytes()
@@ -282,7 +282,7 @@ def set_row(name, row, value):
         (lambda a: a.update({n: v[:0] for n, v in a.items()}), "no keyframe"),
     ],
 )
-def test_tables_that_contradict_each_other_are_refused(rng, tmp_path, change, match):
+def test_inconsistent_tables_are_rejected(rng, tmp_path, change, match):
     saved = Flown(rng).saved()
     write_atlas(tmp_path / "right", saved)
     arrays = {name: saved.arrays[name] for name in COLUMNS}
@@ -316,7 +316,7 @@ def header_of(path):
         ("{", "[" * 10_000 + "{", "nested"),
     ],
 )
-def test_a_header_that_makes_no_sense_is_refused(rng, tmp_path, old, new, match):
+def test_an_invalid_header_is_rejected(rng, tmp_path, old, new, match):
     saved = Flown(rng).saved(Unit(np.eye(4), KNOWN))
     write_atlas(tmp_path / "right", saved)
     text = header_of(tmp_path / "right")

@@ -120,7 +120,7 @@ def closed(ring, atlas):
     return atlas.closures
 
 
-def test_a_closed_loop_takes_the_drift_back(rng):
+def test_a_loop_closure_corrects_the_drift(rng):
     ring = Ring(rng)
     assert ring.gap() > 0.2
     assert ring.error() > 0.3
@@ -140,7 +140,7 @@ def test_a_closed_loop_takes_the_drift_back(rng):
     assert "loop closed in piece 0" in str(closure)
 
 
-def test_both_ends_of_a_closed_loop_see_the_same_anchors(rng):
+def test_both_ends_of_a_closed_loop_share_anchors(rng):
     ring = Ring(rng)
     newest = ring.keyframes[-1]
     assert ring.map.shared_counts(newest.anchor[newest.anchor >= 0]).get(ring.keyframes[3].id, 0) == 0
@@ -187,7 +187,7 @@ def test_without_the_setting_nothing_happens(rng):
     np.testing.assert_array_equal([k.T_c_w for k in ring.keyframes], before)
 
 
-def test_where_nothing_is_seen_again_nothing_happens(rng):
+def test_no_loop_without_a_revisit(rng):
     ring = Ring(rng, keyframes=16)
     before, anchors = [k.T_c_w.copy() for k in ring.keyframes], ring.map.anchors.p_w.copy()
     assert closed(ring, ring.atlas()) == []
@@ -195,7 +195,7 @@ def test_where_nothing_is_seen_again_nothing_happens(rng):
     np.testing.assert_array_equal(ring.map.anchors.p_w, anchors)
 
 
-def test_a_place_that_only_looks_alike_is_not_closed(rng):
+def test_perceptual_aliasing_closes_no_loop(rng):
     """A wall that repeats on the other side: the links are perfect, but no map turns by 180 degrees on six metres."""
     ring = Ring(rng, keyframes=17, drift=0.0 * DRIFT, alike=True)
     found = link(ring.tracker, ring.keyframes[13], ring.keyframes[1])
@@ -206,7 +206,7 @@ def test_a_place_that_only_looks_alike_is_not_closed(rng):
     np.testing.assert_array_equal([k.T_c_w for k in ring.keyframes], before)
 
 
-def test_drift_that_the_window_makes_up_for_needs_no_graph(rng):
+def test_drift_within_reach_of_the_window_needs_no_pose_graph(rng):
     ring = Ring(rng, drift=0.01 * DRIFT)
     before = [k.T_c_w.copy() for k in ring.keyframes]
     assert closed(ring, ring.atlas()) == []
@@ -215,7 +215,7 @@ def test_drift_that_the_window_makes_up_for_needs_no_graph(rng):
     assert max(again) > 50, "but a known place has no second anchors"
 
 
-def test_the_map_of_an_earlier_flight_stays(rng):
+def test_a_loaded_map_is_not_moved_by_a_loop_closure(rng):
     """The flight began in it, and comes back to it."""
     ring = Ring(rng)
     for keyframe in ring.keyframes[:8]:
@@ -227,7 +227,7 @@ def test_the_map_of_an_earlier_flight_stays(rng):
     assert ring.gap() < 0.06
 
 
-def test_neighbours_and_their_neighbours_close_no_loop(rng):
+def test_covisible_keyframes_close_no_loop(rng):
     ring = Ring(rng)
     far = {k.id for k in far_keyframes(ring.map, ring.keyframes[20])}
     assert far == set(range(min(far), max(far) + 1))
@@ -235,14 +235,14 @@ def test_neighbours_and_their_neighbours_close_no_loop(rng):
     assert max(far) in (11, 12, 13), "number 14 shares anchors with 17, which shares anchors with 20"
 
 
-def test_a_keyframe_of_some_seconds_ago_is_not_far(rng):
+def test_a_recent_keyframe_is_no_loop_candidate(rng):
     ring = Ring(rng)
     for keyframe in ring.keyframes:
         keyframe.stamp_s *= 0.1
     assert far_keyframes(ring.map, ring.keyframes[-1]) == []
 
 
-def test_a_drift_that_telemetry_bears_out_may_be_large(rng):
+def test_a_large_drift_confirmed_by_telemetry_is_accepted(rng):
     told = expected_drift(ScaleEstimate(1.8, 0.1), ScaleEstimate(1.0, 0.05))
     assert told is not None
     assert told.allows(np.log(1.8))
@@ -266,7 +266,7 @@ def test_telemetry_decides_whether_a_link_is_plausible(rng):
     assert closed(ring, ring.atlas(metres=lambda stamp_s: ScaleEstimate(np.exp(grown / ROUND * stamp_s), 0.01)))
 
 
-def test_a_map_that_telemetry_holds_closes_no_loop_that_is_beyond_its_drift(rng):
+def test_a_loop_beyond_the_drift_allowed_by_telemetry_is_rejected(rng):
     """A metre off on a way of 12 m, while the drone turns on the spot and nothing tells metres at that moment."""
     far = 4.0 * DRIFT * [1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]
     for drift, telemetry, closes in [
@@ -280,7 +280,7 @@ def test_a_map_that_telemetry_holds_closes_no_loop_that_is_beyond_its_drift(rng)
         assert bool(closed(ring, atlas)) == closes
 
 
-def test_the_longer_the_way_the_more_may_a_map_have_grown(rng):
+def test_the_allowed_scale_drift_grows_with_the_path(rng):
     """By images alone: keyframes hand the scale on, and each may change it a little."""
     ring = Ring(rng, drift=0.0 * DRIFT)
     found = link(ring.tracker, ring.keyframes[ROUND], ring.keyframes[0])
@@ -294,7 +294,7 @@ def test_the_longer_the_way_the_more_may_a_map_have_grown(rng):
     assert is_plausible(ring.map, found)
 
 
-def test_what_is_near_a_closed_loop_has_not_drifted_by_as_much_as_the_way_round(rng):
+def test_the_shortest_covisibility_path_bounds_the_drift(rng):
     """A place that looks alike a metre on: on a way of 12 m the map may have drifted so, on what is left it has not."""
     ring = Ring(rng, drift=0.0 * DRIFT)
     found, beside = (link(ring.tracker, ring.keyframes[ROUND + k], ring.keyframes[k]) for k in (0, 2))
@@ -324,7 +324,7 @@ def guessed(ring, since=ROUND - 2):
     return ring
 
 
-def test_a_drone_that_turns_on_the_spot_closes_its_loop_without_a_scale(rng):
+def test_a_loop_of_a_rotation_closes_without_a_scale(rng):
     """Its images tell where it is and how it is turned, not how large its surroundings are."""
     ring = guessed(Ring(rng))
     assert link(ring.tracker, ring.keyframes[ROUND], ring.keyframes[0]) is None
@@ -335,7 +335,7 @@ def test_a_drone_that_turns_on_the_spot_closes_its_loop_without_a_scale(rng):
     check_map(ring.map)
 
 
-def test_where_all_lies_on_one_plane_the_images_must_tell_the_scale(rng, monkeypatch):
+def test_a_planar_loop_needs_a_scale_from_images(rng, monkeypatch):
     """A wall with the same paper a metre on: found with a fifth of the anchors, and depths are what tells it apart."""
     monkeypatch.setattr(atlas_module, "on_one_plane", lambda *_: True)
     turning, flying = guessed(Ring(rng)), Ring(rng)
@@ -344,7 +344,7 @@ def test_where_all_lies_on_one_plane_the_images_must_tell_the_scale(rng, monkeyp
 
 
 @pytest.mark.parametrize(("turn", "asked"), [(1.1 * LOOP_SEARCH_RAD, 4), (0.3 * LOOP_SEARCH_RAD, 2)])
-def test_while_it_turns_it_looks_back_more_often(rng, monkeypatch, turn, asked):
+def test_loops_are_searched_more_often_during_rotation(rng, monkeypatch, turn, asked):
     """Four keyframes within a second, at the last of which a second has passed."""
     ring, looks = Ring(rng), []
     atlas = ring.atlas()

@@ -30,11 +30,11 @@ def test_noise_on_an_edge_makes_no_corner():
     assert not are_corners(wedge(180.0, noise=3.0), MIDDLE, np.ones(1)).any()
 
 
-def test_a_corner_that_is_fainter_than_the_noise_is_none():
+def test_a_corner_below_the_noise_is_rejected():
     assert not are_corners(wedge(90.0, contrast=4.0), MIDDLE, np.ones(1)).any()
 
 
-def test_the_square_grows_with_the_pyramid_level():
+def test_the_window_grows_with_the_pyramid_level():
     """An edge that bends 10 px away is straight on level 0 and a corner four times as coarse."""
     grey, away = wedge(90.0), np.array([[43.5, 31.5]])
     assert not are_corners(grey, away, np.ones(1)).any()
@@ -42,7 +42,7 @@ def test_the_square_grows_with_the_pyramid_level():
     assert are_corners(grey, away, np.full(1, 4.0)).all()
 
 
-def test_each_keypoint_is_asked_where_it_is():
+def test_each_keypoint_is_evaluated_at_its_position():
     grey = wedge(90.0)
     uv = np.array([[50.0, 31.5], [31.5, 31.5], [5.0, 5.0], [31.5, 55.0], [0.0, 63.0]])
     assert are_corners(grey, uv, np.ones(5)).tolist() == [False, True, False, False, False]

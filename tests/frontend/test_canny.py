@@ -56,7 +56,7 @@ def test_step_below_the_upper_threshold_is_no_edge():
     assert canny(grey, 30.0, 50.0).any()
 
 
-def test_hysteresis_keeps_what_hangs_on_a_strong_pixel():
+def test_hysteresis_keeps_pixels_connected_to_a_strong_one():
     candidate = np.zeros((5, 9), bool)
     candidate[1, 0:4] = candidate[2, 4] = True  # joined by a diagonal
     candidate[4, 0:4] = True  # another line

@@ -96,7 +96,7 @@ def test_position_angle_and_arms_are_accurate(found_and_true):
     assert np.quantile(np.concatenate(angle), 0.95) < 2.5
 
 
-def test_sigma_is_about_the_real_error(found_and_true):
+def test_sigma_matches_the_error(found_and_true):
     z = []
     for found, truth in found_and_true:
         mine, theirs = matched(found, truth)
@@ -116,7 +116,7 @@ def test_arms_are_as_long_as_the_sides(found_and_true):
         assert (np.linalg.norm(uv[:, :, -1] - found.uv[:, None], axis=2) <= 40.0 + 1e-9).all()
 
 
-def test_round_and_straight_things_are_no_corners():
+def test_round_and_straight_contours_are_no_corners():
     image = np.full((480, 640), 60, np.uint8)
     cv2.circle(image, (200, 240), 90, 200, -1, cv2.LINE_AA)
     cv2.ellipse(image, (450, 240), (120, 60), 30, 0, 360, 200, -1, cv2.LINE_AA)

@@ -42,7 +42,7 @@ def test_a_plausible_map_passes_untouched(metres: float) -> None:
         (2.0, 1e30),
     ],
 )
-def test_an_impossible_map_is_none(metres: float, sigma: float) -> None:
+def test_an_implausible_map_is_rejected(metres: float, sigma: float) -> None:
     checked = CheckedDepth(lambda image, camera: depth_map(metres, sigma))
     assert checked(IMAGE, CAMERA) is None
     assert checked.refused == checked.maps == 1
@@ -60,13 +60,13 @@ def test_single_bad_pixels_become_unknown_and_the_rest_stays() -> None:
     assert usable(found).mean() == pytest.approx(130 / 240)
 
 
-def test_a_map_of_mostly_bad_pixels_is_none() -> None:
+def test_a_map_of_mostly_bad_pixels_is_rejected() -> None:
     depth = depth_map(2.0)
     depth.depth_m[:121] = np.nan
     assert CheckedDepth(lambda image, camera: depth)(IMAGE, CAMERA) is None
 
 
-def test_many_refusals_are_one_warning_with_their_count(caplog: pytest.LogCaptureFixture) -> None:
+def test_rejections_give_one_warning_with_their_count(caplog: pytest.LogCaptureFixture) -> None:
     maps = iter([depth_map(2.0), *[depth_map(np.nan)] * 5, depth_map(3.0)])
     checked = CheckedDepth(lambda image, camera: next(maps))
     with caplog.at_level(logging.WARNING):
@@ -76,7 +76,7 @@ def test_many_refusals_are_one_warning_with_their_count(caplog: pytest.LogCaptur
     assert "unusable for 5 of 7 keyframes" in str(checked.warning())
 
 
-def test_a_function_that_knows_nothing_is_no_failure() -> None:
+def test_a_function_without_depth_is_no_failure() -> None:
     checked = CheckedDepth(lambda image, camera: None)
     assert checked(IMAGE, CAMERA) is None
     assert checked.warning() is None
@@ -101,7 +101,7 @@ class Described:
 
 
 @pytest.mark.parametrize("relative", [False, True])
-def test_depth_inside_out_is_not_used_and_said_once(relative, caplog) -> None:
+def test_inverted_depth_is_rejected_with_one_warning(relative, caplog) -> None:
     checked = CheckedDepth(Described(-1.0, relative))
     with caplog.at_level(logging.WARNING):
         assert [checked(IMAGE, CAMERA) for _ in range(8)] == [None] * 8

@@ -94,7 +94,7 @@ def test_a_shrunk_image_is_not_rounded_to_grey_levels() -> None:
 
 
 @pytest.mark.parametrize("size", [(480, 640), (480, 752), (720, 960), (1080, 1920), (640, 480), (240, 320)])
-def test_network_sees_about_the_images_shape_at_the_training_area(size: tuple[int, int]) -> None:
+def test_network_input_has_the_images_shape_at_the_training_area(size: tuple[int, int]) -> None:
     metadata = Metadata(input_height=192, input_width=256)
     h, w = network_size(*size, (metadata.input_height, metadata.input_width))
     assert h % 32 == 0
@@ -107,7 +107,7 @@ def test_training_shape_is_used_for_the_training_cameras() -> None:
     assert network_size(480, 640, (192, 256)) == (192, 256)
 
 
-def test_wrong_size_backend_and_files_are_refused(weights: Path, image: np.ndarray, tmp_path: Path) -> None:
+def test_wrong_size_backend_and_files_are_rejected(weights: Path, image: np.ndarray, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="does not fit"):
         DepthPredictor(weights)(image[:60], CAMERA)
     with pytest.raises(ValueError, match="backend"):
@@ -178,7 +178,7 @@ def changed(tmp_path: Path, metadata: Metadata = METADATA, **tensors: float) -> 
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
-def test_weights_that_give_no_depth_are_refused_when_they_are_loaded(tmp_path: Path, backend: str) -> None:
+def test_weights_without_depth_are_rejected_on_loading(tmp_path: Path, backend: str) -> None:
     with pytest.raises(WeightsError, match=r"w\.safetensors: gives no depth"):
         DepthPredictor(changed(tmp_path, decode_conv6__1__bias=1e5), backend)
     with pytest.raises(WeightsError, match=r"w\.safetensors: gives no depth"):
@@ -189,6 +189,6 @@ def test_weights_that_give_no_depth_are_refused_when_they_are_loaded(tmp_path: P
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
-def test_weights_that_see_nothing_are_refused_when_they_are_loaded(tmp_path: Path, backend: str) -> None:
+def test_weights_with_constant_output_are_rejected_on_loading(tmp_path: Path, backend: str) -> None:
     with pytest.raises(WeightsError, match="the same depth whatever it sees"):
         DepthPredictor(changed(tmp_path, decode_conv6__0__weight=0.0, decode_conv6__1__bias=1.0), backend)

@@ -29,7 +29,7 @@ def test_normals_are_unit_and_nothing_lies_at_the_border():
 
 
 @pytest.mark.parametrize("most", [1000, 3000])
-def test_thinning_keeps_the_number_and_covers_what_there_was(most):
+def test_thinning_respects_the_limit_and_preserves_coverage(most):
     image = views()[0]
     every = extract_edges(image, 40.0, 100.0, 100_000).uv
     some = extract_edges(image, 40.0, 100.0, most).uv

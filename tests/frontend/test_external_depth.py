@@ -38,7 +38,7 @@ def image():
 
 @pytest.mark.parametrize("gives", ["metres", "log_metres", "inverse_metres"])
 @pytest.mark.parametrize("plane", [False, True])
-def test_metres_come_out_whatever_the_numbers_mean(tmp_path, image, gives, plane):
+def test_every_output_type_gives_metres(tmp_path, image, gives, plane):
     path = green_network(tmp_path / "net.onnx", plane=plane, **GREEN[gives])
     network = open_depth(describe(path, f'gives = "{gives}"\nfocal_px = 80.0\n{SIZE}'))
     found = network(image, CAMERA)
@@ -48,7 +48,7 @@ def test_metres_come_out_whatever_the_numbers_mean(tmp_path, image, gives, plane
     np.testing.assert_allclose(found.sigma_log, 0.25)
 
 
-def test_a_network_for_any_camera_is_taken_at_its_word(tmp_path, image):
+def test_a_network_for_any_camera_is_not_rescaled(tmp_path, image):
     network = open_depth(describe(green_network(tmp_path / "net.onnx"), f'gives = "metres"\nsigma_log = 0.1\n{SIZE}'))
     found = network(image, CAMERA)
     np.testing.assert_allclose(found.depth_m[:, :80], NEAR_M, rtol=1e-5)
@@ -150,21 +150,21 @@ def test_size_that_the_network_does_not_take_is_one_line(tmp_path, image):
         (0.0, "relative_inverse", "gives no depth"),
     ],
 )
-def test_network_without_depth_is_refused(tmp_path, number, gives, words):
+def test_network_without_depth_is_rejected(tmp_path, number, gives, words):
     nodes = [node("Mul", "depth none", "zero"), node("Add", "zero number", "bad")]
     path = green_network(tmp_path / "net.onnx", nodes, "bad", constants={"none": 0.0, "number": number})
     with pytest.raises(WeightsError, match=words):
         open_depth(describe(path, f'gives = "{gives}"\n{SIZE}'))
 
 
-def test_network_that_sees_nothing_is_refused(tmp_path):
+def test_network_with_constant_output_is_rejected(tmp_path):
     nodes = [node("Mul", "depth none", "zero"), node("Add", "zero number", "same")]
     path = green_network(tmp_path / "net.onnx", nodes, "same", constants={"none": 0.0, "number": 2.0})
     with pytest.raises(WeightsError, match="the same depth whatever it sees"):
         open_depth(describe(path, f'gives = "metres"\n{SIZE}'))
 
 
-def test_pixels_without_a_number_are_unknown(tmp_path, image):
+def test_non_finite_pixels_are_unknown(tmp_path, image):
     """The logarithm of what is black after a shift is no number: those pixels alone have no depth."""
     nodes = [node("Sub", "depth near2", "less"), node("Log", "less", "log"), node("Exp", "log", "again")]
     path = green_network(tmp_path / "net.onnx", nodes, "again", constants={"near2": 2.0})
@@ -174,7 +174,7 @@ def test_pixels_without_a_number_are_unknown(tmp_path, image):
     np.testing.assert_allclose(found.depth_m[:, 112:], FAR_M - 2.0, rtol=1e-4)
 
 
-def test_an_image_without_differences_has_no_relative_depth():
+def test_constant_output_gives_no_relative_depth():
     assert np.isnan(relative_depth(np.full((4, 4), 3.0, np.float32))).all()
     assert np.isnan(relative_depth(np.full((4, 4), np.nan, np.float32))).all()
 
@@ -228,7 +228,7 @@ def test_weights_that_come_with_the_package_have_names(image):
     assert weights_file("a/b.safetensors") == Path("a/b.safetensors")
 
 
-def test_a_name_that_nobody_knows_lists_what_there_is():
+def test_an_unknown_name_lists_the_available_ones():
     with pytest.raises(WeightsError, match="midas-small"):
         weights_path("midas_small")
 
@@ -243,7 +243,7 @@ def test_a_name_that_nobody_knows_lists_what_there_is():
         ("relative_inverse", "metres"),
     ],
 )
-def test_what_the_numbers_are_is_told_from_depth_that_is_right(tmp_path, image, numbers, described):
+def test_the_output_type_is_inferred_from_a_reference(tmp_path, image, numbers, described):
     path = describe(green_network(tmp_path / "net.onnx", **GREEN[numbers]), f'gives = "{described}"\n{SIZE}')
     truth = NEAR_M + (FAR_M - NEAR_M) * image[..., 1].astype(np.float32) / 255
     said = ExternalDepth(path).said_instead(image, CAMERA, DepthMap(truth, np.ones_like(truth)))
@@ -253,26 +253,26 @@ def test_what_the_numbers_are_is_told_from_depth_that_is_right(tmp_path, image, 
 @pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize("size", [("h", "w"), (128, 192)])
 @pytest.mark.parametrize("numbers", [TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.DOUBLE, TensorProto.UINT8])
-def test_input_comes_in_the_graphs_numbers_and_layout(tmp_path, image, numbers, size, last):
+def test_input_has_the_graphs_data_type_and_layout(tmp_path, image, numbers, size, last):
     path = green_network(tmp_path / "net.onnx", numbers=numbers, last=last, size=size)
     found = open_depth(describe(path, f'gives = "metres"\n{SIZE}'))(image, CAMERA)
     np.testing.assert_allclose(found.depth_m[:, :80], NEAR_M, rtol=1e-3)
     np.testing.assert_allclose(found.depth_m[:, 112:], FAR_M, rtol=1e-3)
 
 
-def test_input_of_any_size_gets_a_usual_one_and_says_so(tmp_path, caplog):
+def test_input_of_any_size_gets_a_default_with_a_remark(tmp_path, caplog):
     network = open_depth(describe(green_network(tmp_path / "net.onnx"), 'gives = "metres"\nmultiple = 14\n'))
     assert network.network.input_height == network.network.input_width == 518
     assert "say input_height and input_width" in caplog.text
 
 
-def test_of_several_outputs_the_first_is_said(tmp_path, caplog):
+def test_the_first_of_several_outputs_is_used_with_a_remark(tmp_path, caplog):
     path = green_network(tmp_path / "net.onnx", [node("Log", "depth", "log")], "depth log")
     open_depth(describe(path, f'gives = "metres"\n{SIZE}'))
     assert "say depth" in caplog.text
 
 
-def test_numbers_in_a_file_beside_it_are_read_and_no_others(tmp_path, image):
+def test_only_external_data_beside_the_file_is_read(tmp_path, image):
     whole = onnx.load(green_network(tmp_path / "whole.onnx"))
     path = tmp_path / "net.onnx"
     onnx.save(whole, path, save_as_external_data=True, location="net.onnx.data", size_threshold=0)

@@ -49,7 +49,7 @@ def test_unrelated_descriptors_do_not_match(rng):
     assert len(match_all(random_words(rng, 200), random_words(rng, 200), 64, 0.85)) == 0
 
 
-def test_twins_are_refused_by_the_ratio(rng):
+def test_ambiguous_matches_are_rejected_by_the_ratio(rng):
     a = random_words(rng, 10)
     twins = np.concatenate([a, a])
     assert len(match_all(flipped(rng, a, 5), twins, 64, 0.85)) == 0
@@ -95,7 +95,7 @@ def test_guided_search_over_the_whole_image_finds_what_brute_force_finds(rng):
     assert dict(zip(guided.query, guided.train, strict=True)) == dict(zip(brute.query, brute.train, strict=True))
 
 
-def test_guided_search_tells_twins_apart_by_their_place(rng):
+def test_guided_search_distinguishes_similar_keypoints_by_position(rng):
     """Repeated texture: brute force refuses all, the predicted pixel decides."""
     a = np.repeat(random_words(rng, 5), 4, axis=0)
     uv = np.stack(np.meshgrid(np.arange(5) * 50.0, np.arange(4) * 50.0, indexing="ij"), axis=-1).reshape(-1, 2)

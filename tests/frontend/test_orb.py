@@ -31,7 +31,7 @@ def test_keypoints_are_described_and_inside():
     assert features.octave.max() < 8
 
 
-def test_faint_corners_are_found_where_there_is_little_else():
+def test_faint_corners_are_found_with_few_others():
     """A tenth of the contrast of a textured image: few corners pass the usual threshold, most the faint one."""
     faint = (128 + 0.1 * (views()[0][..., 1].astype(float) - 128)).astype(np.uint8)
     usual = OrbExtractor(OrbConfig(fast_faint=12), CAMERA)(faint)
@@ -40,7 +40,7 @@ def test_faint_corners_are_found_where_there_is_little_else():
     assert found.faint
 
 
-def test_where_corners_abound_faint_ones_change_nothing():
+def test_with_many_corners_faint_ones_change_nothing():
     grey = views()[0][..., 1].copy()
     config = OrbConfig(features=400)
     a, b = (OrbExtractor(c, CAMERA)(grey) for c in (config, OrbConfig(features=400, fast_faint=12)))
@@ -101,7 +101,7 @@ def _squares(rng):
     return cv2.GaussianBlur(image, (0, 0), 0.7), np.array(corners)
 
 
-def test_spread_keeps_the_few_of_a_poor_corner_of_the_image(rng):
+def test_spread_keeps_the_few_corners_of_a_weakly_textured_region(rng):
     """2000 strong corners on the left, 12 weak ones on the right: the right keeps its own."""
     left = rng.uniform([0, 0], [300, 480], (2000, 2))
     right = rng.uniform([500, 100], [640, 400], (12, 2))

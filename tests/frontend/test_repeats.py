@@ -52,7 +52,7 @@ def test_a_motion_too_slow_for_two_images_adds_up(rng):
     assert runs.max() < 30
 
 
-def test_an_encoder_lets_a_still_picture_be_recognised(rng, tmp_path):
+def test_a_static_image_is_recognised_after_encoding(rng, tmp_path):
     """A re-encoded frozen video differs in single bits."""
     path = str(tmp_path / "frozen.mp4")
     writer = cv2.VideoWriter(path, cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (320, 240))
@@ -71,13 +71,13 @@ def test_an_encoder_lets_a_still_picture_be_recognised(rng, tmp_path):
     assert "stood still" in warning
 
 
-def test_several_stretches_are_one_sentence(rng):
+def test_several_stretches_give_one_warning(rng):
     still, other = room(rng), room(rng)
     _, warning = seen([still] * 30 + [other] * 45)
     assert "stood still 2 times, the longest from 101.0 to 102.5 s" in warning
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5)])
-def test_tiny_images_do_not_hurt(size):
+def test_tiny_images_are_accepted(size):
     found, _ = seen([np.zeros(size, np.uint8)] * 3)
     assert found == [False, True, True]

@@ -66,7 +66,7 @@ def test_resized_camera_sees_the_corners_of_the_image_at_its_corners():
 @pytest.mark.parametrize(
     "numbers", [(0, 480, 500, 500, 320, 240), (640, 480, -1, 500, 320, 240), (640, 480, np.nan, 500, 320, 240)]
 )
-def test_impossible_cameras_are_refused(numbers):
+def test_implausible_cameras_are_rejected(numbers):
     with pytest.raises(CalibrationError):
         Camera(*numbers)
 

@@ -22,7 +22,7 @@ def test_own_file_round_trips(tmp_path):
     assert (back.fx, back.cy, back.distortion) == (517.306408, 255.313989, PRESETS["tum_fr1"].distortion)
 
 
-def test_how_well_the_focal_length_is_known_goes_with_the_file(tmp_path):
+def test_the_focal_sigma_is_saved_with_the_file(tmp_path):
     save_camera(tmp_path / "camera.yaml", replace(PRESETS["kinect"], focal_sigma=0.12))
     assert load_camera(tmp_path / "camera.yaml").focal_sigma == 0.12
     (tmp_path / "plain.yaml").write_text(GOOD)
@@ -37,7 +37,7 @@ def test_ros_file(tmp_path):
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_load_and_say_so(name):
+def test_presets_load_with_their_source(name):
     assert load_camera(name).source == f"preset {name}"
 
 
@@ -70,7 +70,7 @@ def test_presets_load_and_say_so(name):
         (ROS.replace("plumb_bob", "equidistant"), "equidistant takes 4"),
     ],
 )
-def test_wrong_file_is_refused_by_name(tmp_path, text, words):
+def test_an_invalid_file_is_rejected_by_name(tmp_path, text, words):
     (tmp_path / "c.yaml").write_text(text)
     with pytest.raises(CalibrationError, match=f"c.yaml: .*{words}"):
         load_camera(tmp_path / "c.yaml")

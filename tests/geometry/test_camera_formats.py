@@ -127,7 +127,7 @@ def test_the_same_numbers_are_the_same_camera(tmp_path, name):
     ("name", "word"),
     [("two cameras", "cam0"), ("colmap, two", "number 1"), ("orb-slam 3", "Camera2"), ("dpvo", "size")],
 )
-def test_what_was_chosen_or_assumed_is_said(tmp_path, name, word):
+def test_choices_and_assumptions_are_reported(tmp_path, name, word):
     assert any(word in remark for remark in _read(tmp_path, FORMATS[name])[1])
 
 
@@ -154,7 +154,7 @@ FISHEYES = {
 
 
 @pytest.mark.parametrize("name", FISHEYES)
-def test_a_narrow_fisheye_is_fitted_and_its_error_said(tmp_path, name):
+def test_a_narrow_fisheye_is_fitted_and_its_error_reported(tmp_path, name):
     camera, remarks = _read(tmp_path, FISHEYES[name])
     p = np.array([[0.3, 0.2, 1.0], [-0.35, 0.1, 1.0], [0.0, -0.25, 1.0]])
     truth, _ = cv2.fisheye.projectPoints(p[:, None], np.zeros(3), np.zeros(3), camera.K, np.array(FISHEYE))
@@ -234,7 +234,7 @@ LAUGHS = "<!DOCTYPE l [<!ENTITY a 'ha'>]>"
         OWN + "# " + "x" * 300_000,
     ],
 )
-def test_what_is_not_understood_is_refused_in_one_line(tmp_path, text):
+def test_unsupported_content_is_rejected_in_one_line(tmp_path, text):
     with pytest.raises(CalibrationError) as raised:
         _read(tmp_path, text)
     assert "\n" not in str(raised.value)

@@ -26,7 +26,7 @@ def test_real_lenses_are_one_to_one_over_the_whole_image(name):
 
 
 @pytest.mark.parametrize("k1", [-0.1, -0.25, -0.35, -0.6])
-def test_share_of_a_barrel_is_where_its_radius_turns_back(k1):
+def test_the_invertible_share_of_a_barrel_ends_at_its_fold(k1):
     """r (1 + k1 r^2) is largest at r = 1 / sqrt(-3 k1): two thirds of that."""
     camera = Camera(640, 480, 400.0, 400.0, 319.5, 239.5, (k1, 0.0, 0.0, 0.0, 0.0))
     turn = 2.0 / 3.0 / np.sqrt(-3.0 * k1)
@@ -47,7 +47,7 @@ def test_share_of_a_barrel_is_where_its_radius_turns_back(k1):
         (0.0, 0.0, 0.0, 0.0, -5.0),
     ],
 )
-def test_what_no_lens_does_is_refused(distortion):
+def test_implausible_distortion_is_rejected(distortion):
     with pytest.raises(CalibrationError, match="cannot be a lens's"):
         check_camera(Camera(640, 480, 400.0, 400.0, 320.0, 240.0, distortion))
 
@@ -62,7 +62,7 @@ def test_what_no_lens_does_is_refused(distortion):
         (500.0, 500.0, 320.0, 721.0),
     ],
 )
-def test_what_cannot_be_pixels_is_refused(numbers):
+def test_implausible_pixel_values_are_rejected(numbers):
     with pytest.raises(CalibrationError, match="cannot be pixels of a 640x480 image"):
         check_camera(Camera(640, 480, *numbers))
 

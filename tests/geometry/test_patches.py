@@ -36,7 +36,7 @@ def test_a_shifted_patch_is_found_to_a_fiftieth_of_a_pixel(shift, brighter):
     assert found.sigma_px.max() < 0.1
 
 
-def test_its_sigma_is_what_noise_makes_of_it(rng):
+def test_sigma_matches_the_noise(rng):
     off = []
     for _ in range(20):
         shift = rng.uniform(-0.8, 0.8, 2)
@@ -47,7 +47,7 @@ def test_its_sigma_is_what_noise_makes_of_it(rng):
     assert abs(np.mean(off)) < 0.15
 
 
-def test_a_view_from_elsewhere_is_found_with_its_warp():
+def test_a_distant_view_is_found_with_its_warp():
     """The camera that sees the texture twice as far away and turned by half a radian."""
     c, s = np.cos(0.5), np.sin(0.5)
     A = 1.4 * np.array([[c, -s], [s, c]])
@@ -79,7 +79,7 @@ def test_nothing_is_found_on_a_bare_wall():
     assert np.isinf(found.sigma_px).all() and np.array_equal(found.uv, PLACES)
 
 
-def test_a_straight_edge_tells_nothing_along_it():
+def test_a_straight_edge_is_unobservable_along_itself():
     v, u = np.mgrid[:240, :320].astype(float)
     edge = np.clip(128 + 60 * np.tanh(u - 60.0), 0, 255).astype(np.uint8)
     assert not (find(edge, PLACES, templates(edge, PLACES, SAME)).sigma_px < 0.5).any()
@@ -94,7 +94,7 @@ def test_a_point_in_the_other_cameras_plane_is_not_found():
     assert np.isinf(found.sigma_px[0]) and np.isfinite(found.uv).all()
 
 
-def test_no_patch_is_no_patch():
+def test_no_patches_give_no_results():
     none = np.zeros((0, 2))
     found = find(image(), none, templates(image(), none, np.zeros((0, 2, 2))))
     assert found.uv.shape == (0, 2) and found.sigma_px.shape == (0,)

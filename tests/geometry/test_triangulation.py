@@ -40,7 +40,7 @@ def test_noise_moves_points_by_what_their_parallax_allows(rng):
     assert np.median((np.linalg.norm(p_c - truth, axis=1) / sigma)[seen]) < 1.5
 
 
-def test_parallel_rays_give_no_number():
+def test_parallel_rays_give_nan():
     T_j_i = np.eye(4)
     T_j_i[0, 3] = -1.0
     ray = np.array([[0.1, 0.0, 1.0]])

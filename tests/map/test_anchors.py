@@ -20,13 +20,13 @@ def anchors(observations, from_depth):
     return out, ids
 
 
-def test_depths_on_priors_are_given_out_with_the_sigma_of_the_prior():
+def test_exported_anchors_with_depth_priors_have_the_sigma_of_the_prior():
     some, ids = anchors([3, 3], [False, True])
     cloud = some.cloud(ids)
     assert cloud.sigma_m == pytest.approx([0.1, 0.8 * 4.0])
     assert cloud.observations.tolist() == [3, 3]
 
 
-def test_what_one_keyframe_alone_has_seen_is_not_given_out():
+def test_anchors_of_a_single_keyframe_are_not_exported():
     some, ids = anchors([1, 2, 1], [True, True, False])
     assert len(some.cloud(ids).p_w) == 1

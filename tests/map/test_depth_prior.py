@@ -9,7 +9,7 @@ from edgeslam_torch.map.depth_prior import depth_prior, fit_to_anchors, sample
 from edgeslam_torch.types import DepthMap
 
 
-def test_sample_takes_the_nearest_pixel_and_knows_holes():
+def test_sampling_takes_the_nearest_pixel_and_preserves_holes():
     depth = np.array([[1.0, 2.0, 0.0], [4.0, np.nan, 6.0]], np.float32)
     sigma = np.full((2, 3), 0.25, np.float32)
     uv = np.array([[0.4, 0.4], [0.6, 0.0], [2.0, 0.0], [1.0, 1.0], [9.0, 9.0], [-3.0, 1.0]])
@@ -28,7 +28,7 @@ def test_fit_finds_the_ratio_despite_a_third_of_outliers(rng):
     assert fit.sigma_log == 0.02  # its floor: most agree exactly
 
 
-def test_fit_says_how_far_anchors_scatter(rng):
+def test_fit_returns_the_scatter_of_anchors(rng):
     network = rng.uniform(0.5, 5.0, 4000)
     fit = fit_to_anchors(network, network * np.exp(rng.normal(0.3, 0.2, 4000)))
     assert fit.log_ratio == pytest.approx(0.3, abs=0.02)
@@ -53,7 +53,7 @@ def true_depth(points, view):
     return se3.transform(points.world.T_c_w[view], points.world.p_w)[points.point_of[view], 2]
 
 
-def test_network_is_brought_to_map_units(points):
+def test_network_depth_is_scaled_to_map_units(points):
     keyframe, z = points.keyframes[0], true_depth(points, 0)
     depth = np.full((480, 640), np.nan, np.float32)
     u, v = np.rint(keyframe.features.uv).astype(int).T
@@ -64,7 +64,7 @@ def test_network_is_brought_to_map_units(points):
     np.testing.assert_allclose(sigma, np.hypot(0.12, 0.05), rtol=1e-6)
 
 
-def test_without_a_network_anchors_nearby_tell(points):
+def test_neighbouring_anchors_replace_a_missing_network(points):
     keyframe, z = points.keyframes[0], true_depth(points, 0)
     prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors, 0.35)
     assert (sigma == 0.35).all()
@@ -74,7 +74,7 @@ def test_without_a_network_anchors_nearby_tell(points):
     assert np.mean(np.abs(np.log(prior / z)) < 0.35) > 0.68
 
 
-def test_keyframe_without_anchors_knows_nothing(points):
+def test_keyframe_without_anchors_has_a_wide_prior(points):
     keyframe = points.keyframes[0]
     keyframe.anchor[:] = -1
     prior, sigma = depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors, 0.35)
@@ -89,7 +89,7 @@ def test_anchors_behind_the_camera_do_not_count(points):
 
 
 @pytest.mark.parametrize(("twist", "sigma_log"), [(0.0, 0.051), (0.3, 0.061)])
-def test_network_that_errs_is_bent_towards_the_anchors_and_trusted_less(points, twist, sigma_log):
+def test_a_wrong_network_is_corrected_by_anchors_with_a_larger_sigma(points, twist, sigma_log):
     """An error that grows across the image, as in an unfamiliar room, with a stated sigma of 1 %."""
     keyframe, z = points.keyframes[0], true_depth(points, 0)
     u, v = np.rint(keyframe.features.uv).astype(int).T
@@ -114,7 +114,7 @@ def relative_map(points, view, scale=0.7, shift=0.02):
     return DepthMap(depth, np.full((480, 640), 0.25, np.float32), is_relative=True)
 
 
-def test_relative_network_is_brought_to_the_map_by_scale_and_shift(points):
+def test_relative_depth_is_fitted_by_scale_and_shift(points):
     keyframe, z = points.keyframes[0], true_depth(points, 0)
     keyframe.depth = relative_map(points, 0)
     prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors, 0.35)
@@ -124,7 +124,7 @@ def test_relative_network_is_brought_to_the_map_by_scale_and_shift(points):
     assert np.median(sigma) < 0.1
 
 
-def test_anchors_that_rest_on_a_relative_network_do_not_say_its_scale(points):
+def test_anchors_from_relative_depth_do_not_fit_its_scale(points):
     keyframe = points.keyframes[0]
     keyframe.depth = relative_map(points, 0)
     points.map.anchors.from_depth[:] = True

@@ -29,7 +29,7 @@ def test_drift_between_views_is_found(rng, sigma):
     assert bend(flight(rng, errors), CAMERA) == pytest.approx(SHARED * sigma, rel=0.25)
 
 
-def test_neighbours_are_not_asked(rng):
+def test_neighbouring_keyframes_are_not_compared(rng):
     """Three keyframes that were refined together agree, whatever the drift from those three to the next three."""
     errors = np.repeat([0.0, 0.02, 0.04, 0.06], 3)
     apart = np.abs(np.subtract.outer(np.arange(12), np.arange(12))) >= 3
@@ -37,16 +37,16 @@ def test_neighbours_are_not_asked(rng):
     assert bend(flight(rng, errors, gap=0.01), CAMERA) == pytest.approx(SHARED * expected, rel=0.1)
 
 
-def test_views_that_agree_have_none(rng):
+def test_consistent_views_have_no_drift(rng):
     assert bend(flight(rng, np.zeros(20)), CAMERA) < 1e-6
 
 
-def test_an_error_that_all_share_is_not_seen(rng):
+def test_a_common_error_is_unobservable(rng):
     """Which is why `SHARED` is more than one."""
     assert bend(flight(rng, np.full(20, 0.1)), CAMERA) < 0.01
 
 
-def test_edges_that_are_mistaken_for_others_do_not_count(rng):
+def test_mismatched_edges_are_ignored(rng):
     views = flight(rng, 0.01 * rng.standard_normal(40))
     right = bend(views, CAMERA)
     for view in views:
@@ -56,7 +56,7 @@ def test_edges_that_are_mistaken_for_others_do_not_count(rng):
 
 
 @pytest.mark.parametrize("case", ["none", "neighbours", "opposite"])
-def test_where_nothing_overlaps_it_is_the_usual(rng, case):
+def test_without_overlap_the_default_applies(rng, case):
     views = flight(rng, 0.1 * rng.standard_normal(12))
     if case == "none":
         views = []

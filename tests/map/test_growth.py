@@ -45,7 +45,7 @@ def test_anchors_are_expected_on_the_same_pyramid_level_and_depth(points, factor
     check_map(points.map)
 
 
-def test_a_keyframe_that_sees_too_little_does_not_tell(points):
+def test_a_keyframe_with_few_anchors_gives_no_estimate(points):
     before = depths(points.map, points.keyframes[:1])
     held, z = before[0]
     far = points.map.anchors.max_distance.copy()

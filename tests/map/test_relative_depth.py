@@ -39,7 +39,7 @@ def test_sigma_covers_the_truth_and_grows_beyond_the_anchors(scene, rng):
     assert np.mean(np.abs(errors) < 2.0) >= 0.9
 
 
-def test_network_that_takes_near_for_far_is_no_fit(scene):
+def test_inverted_depth_is_no_fit(scene):
     z, relative = scene
     assert fit_inverse(1.0 / relative, z) is None
 
@@ -57,6 +57,6 @@ def test_too_few_anchors_are_no_fit(scene, bad):
     assert fit_inverse(relative, np.where(np.arange(len(z)) < MIN_ANCHORS - 1, z, -1.0)) is None
 
 
-def test_anchors_on_one_wall_say_nothing_about_the_shift():
+def test_anchors_at_one_depth_do_not_determine_the_shift():
     fit = fit_inverse(np.full(50, 2.0), np.full(50, 3.0))
     assert fit is None

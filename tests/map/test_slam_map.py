@@ -104,7 +104,7 @@ def test_map_stays_consistent_under_random_changes(seed):
         check_map(scribbler.map)
 
 
-def test_rows_of_removed_anchors_serve_again_only_in_the_next_pass():
+def test_rows_of_removed_anchors_are_reused_only_in_the_next_pass():
     anchors = SlamMap(1.2).anchors
     bits = np.zeros((3, 4), np.uint64)
     colour = np.zeros((3, 3), np.uint8)
@@ -136,7 +136,7 @@ def test_covisible_keyframes_come_by_number_of_shared_anchors(rng):
     np.testing.assert_array_equal(points.map.anchors_seen_by([first]), np.sort(first.anchor[first.anchor >= 0]))
 
 
-def test_refreshed_anchor_faces_its_cameras_and_knows_its_distance(rng):
+def test_refreshed_anchor_has_the_direction_and_distance_of_its_cameras(rng):
     points = PointMap(rng, 100, 3)
     anchor_of = points.fill()
     point = int(np.flatnonzero(points.world.visible.all(0))[0])
@@ -148,7 +148,7 @@ def test_refreshed_anchor_faces_its_cameras_and_knows_its_distance(rng):
     np.testing.assert_allclose(points.map.anchors.max_distance[id], newest)
 
 
-def test_a_keyframe_belongs_to_the_piece_that_it_was_tracked_in(rng):
+def test_a_keyframe_belongs_to_the_submap_in_which_it_was_tracked(rng):
     """Relocalised in the first piece while a second one exists: that joins nothing."""
     points = PointMap(rng, 300, 3)
     first, second, again = points.keyframes
@@ -165,7 +165,7 @@ def test_a_keyframe_belongs_to_the_piece_that_it_was_tracked_in(rng):
     assert [points.map.piece_of(k.id) for k in points.keyframes] == [0, 0, 0]
 
 
-def test_a_piece_that_holds_nothing_gives_its_number_to_the_next(rng):
+def test_the_number_of_an_empty_submap_is_reused(rng):
     points = PointMap(rng, 300, 2)
     for begun in ("dark", "still dark"):
         points.map.begin_piece(begun)
@@ -173,7 +173,7 @@ def test_a_piece_that_holds_nothing_gives_its_number_to_the_next(rng):
     assert points.map.piece == 0
 
 
-def test_frames_of_a_removed_keyframe_stay_in_their_piece(rng):
+def test_frames_of_a_removed_keyframe_stay_in_their_submap(rng):
     """The keyframe next in time is of another piece, which may move without this one."""
     points = PointMap(rng, 300, 3)
     first, other, mine = points.keyframes

@@ -80,7 +80,7 @@ def test_a_third_view_is_aligned_with_the_first_one_not_with_the_second(seen):
     assert np.isfinite(first.aligned_px).any() and np.isnan(second.aligned_px).all()
 
 
-def test_sigmas_hold_the_limit_and_what_noise_adds(seen):
+def test_sigmas_include_the_limit_and_the_noise(seen):
     slam_map, (first, second, _) = seen
     align(slam_map, second, CAMERA)
     aligned = np.isfinite(second.aligned_px)
@@ -91,7 +91,7 @@ def test_sigmas_hold_the_limit_and_what_noise_adds(seen):
     assert np.isnan(first.aligned_px[~partners]).all()
 
 
-def test_a_keypoint_of_something_else_stays_where_it_was(seen):
+def test_a_mismatched_keypoint_is_not_aligned(seen):
     slam_map, (_, second, _) = seen
     wrong = second.keypoints_with_anchor()[::4]
     second.features.uv[wrong] += (6.0 * SCALE ** second.features.octave[wrong])[:, None].astype(np.float32)
@@ -110,7 +110,7 @@ def test_a_view_from_half_as_far_is_aligned_as_well():
     assert len(aligned) > 40 and np.median(off_px(slam_map, keyframes[1], aligned)) < 0.25
 
 
-def test_an_alignment_does_not_go_to_the_next_tile(seen):
+def test_alignment_does_not_jump_by_a_period_of_the_texture(seen):
     """Two pixels are not what quantisation does to a corner."""
     slam_map, (_, second, _) = seen
     far = second.keypoints_with_anchor()[::3]
@@ -121,7 +121,7 @@ def test_an_alignment_does_not_go_to_the_next_tile(seen):
     assert went.max() < 1.5
 
 
-def test_without_an_image_nothing_moves(seen):
+def test_without_an_image_nothing_is_aligned(seen):
     slam_map, (first, second, _) = seen
     second.grey = None
     before = second.features.uv.copy()
@@ -131,7 +131,7 @@ def test_without_an_image_nothing_moves(seen):
     assert np.array_equal(second.features.uv, before) and np.isnan(second.aligned_px).all()
 
 
-def test_anchors_behind_a_view_are_not_looked_for_in_it(seen):
+def test_anchors_behind_a_view_are_not_aligned(seen):
     slam_map, (first, second, third) = seen
     slam_map.anchors.p_w[first.anchor] -= 10.0 * first.T_w_c[:3, 2]
     assert align(slam_map, second, CAMERA) == align(slam_map, third, CAMERA) == 0

@@ -7,7 +7,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.trajectory import TrajectoryLog
 
 
-def test_frames_move_with_their_keyframe_also_when_it_is_gone(rng):
+def test_frames_follow_their_keyframe_even_after_its_removal(rng):
     """Refinement moves the heir of a removed keyframe by M: the frames tied to either follow rigidly."""
     points = PointMap(rng, 200, 3)
     points.fill()
@@ -70,7 +70,7 @@ def test_frames_follow_the_next_keyframe_where_refinement_moved_it(rng):
     np.testing.assert_allclose(log.poses()[1][:, 0, 3], [0.0, 0.2, 0.4, 0.6, 0.4, 0.5], atol=1e-12)
 
 
-def test_the_way_from_a_keyframe_of_the_first_map_is_closed_as_well(rng):
+def test_frames_of_the_first_map_are_corrected_too(rng):
     """It was never tracked as a frame; those after it are tied to it, those before it to the first keyframe."""
     points = PointMap(rng, 200, 3)
     points.fill()

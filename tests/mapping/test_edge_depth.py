@@ -75,26 +75,26 @@ def test_sigma_covers_the_error():
 
 
 @pytest.mark.parametrize("factor", [0.75, 1.3])
-def test_prior_that_is_off_by_a_third_changes_little(factor):
+def test_prior_with_an_error_of_a_third_changes_little(factor):
     result, truth = measured(slanted_wall(), factor)
     known = np.isfinite(result.inverse_depth)
     assert known.mean() > 0.3
     assert np.median(np.abs(result.inverse_depth * truth - 1.0)[known]) < 0.006
 
 
-def test_true_depth_outside_the_search_is_not_made_up():
+def test_true_depth_outside_the_search_gives_no_measurement():
     """An overconfident prior three times too deep: almost nothing may count as measured."""
     result, _ = measured(slanted_wall(), 3.0, 0.1)
     assert np.isfinite(result.inverse_depth).mean() < 0.05
 
 
-def test_edges_along_the_epipolar_line_are_left_out():
+def test_edges_along_the_epipolar_line_are_omitted():
     result, _ = measured(slanted_wall(True))
     assert len(result.inverse_depth) > 200
     assert np.isfinite(result.inverse_depth).mean() < 0.01
 
 
-def test_nothing_to_look_in():
+def test_without_targets_nothing_is_measured():
     result, truth = measured(slanted_wall(), targets=())
     assert np.isnan(result.inverse_depth).all()
     assert result.inverse_depth.shape == result.sigma.shape == truth.shape
@@ -152,7 +152,7 @@ def at_middle(flight, sigma_log):
     return edges, truth, measure_edge_depth(views[1], edges.uv, edges.normal, truth, sigma, others, CAMERA)
 
 
-def test_a_picket_fence_is_measured_only_where_the_prior_tells_pickets_apart():
+def test_a_periodic_texture_is_measured_only_with_an_unambiguous_prior():
     """A picket is 10.4 px, a disparity 7.8 px: up to 27 px there are two that look alike, up to 9.5 px only one."""
     _, truth, wide = at_middle(pickets(), 0.5)
     assert len(truth) > 300

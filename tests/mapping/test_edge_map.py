@@ -31,7 +31,7 @@ def test_fusing_nothing_gives_nothing():
     assert len(cloud.observations) == 0
 
 
-def test_fused_points_stay_apart_and_inside(rng):
+def test_fused_points_stay_in_their_cells(rng):
     p = rng.uniform(-1, 1, (5000, 3))
     cloud = fuse_voxels(p, np.full(5000, 0.01), np.zeros((5000, 3), np.uint8), np.full(5000, 2), 0.1)
     cells = np.floor(cloud.p_w / 0.1).astype(int)
@@ -66,7 +66,7 @@ def edge_map(points, **settings):
     return EdgeMap(points.map, CAMERA, EdgeConfig(**settings), 0.35)
 
 
-def test_points_that_two_keyframes_measured_alike_count_twice(points):
+def test_consistent_points_of_two_keyframes_count_twice(points):
     p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:60]
     a, b = host(points, 0, p_w), host(points, 1, p_w)
     b.p_c[:10] *= 1.2  # measured 20 % deeper: not the same point
@@ -102,7 +102,7 @@ def test_edge_points_move_with_their_keyframe(points, rng):
     np.testing.assert_allclose(after[order[0]], se3.transform(M, before)[order[1]], atol=1e-5)
 
 
-def test_only_agreed_points_are_given_out(points):
+def test_only_confirmed_points_are_exported(points):
     p_w = points.world.p_w[:30]
     counts = np.r_[np.ones(10), np.full(20, 2)].astype(np.int32)
     some = edge_map(points, voxel=1e-6)
@@ -111,7 +111,7 @@ def test_only_agreed_points_are_given_out(points):
     assert edge_map(points).points().p_w.shape == (0, 3)
 
 
-def test_edges_around_a_keyframe_are_the_agreed_and_sure_ones_of_those_that_see_the_same(points):
+def test_edges_around_a_keyframe_are_confirmed_certain_and_covisible(points):
     p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:60]
     z = se3.transform(points.map.pose_of(1), p_w)[:, 2]
     observations = np.where(np.arange(60) < 50, 2, 1).astype(np.int32)
@@ -125,7 +125,7 @@ def test_edges_around_a_keyframe_are_the_agreed_and_sure_ones_of_those_that_see_
     assert edges.around(first).shape == (0, 3)
 
 
-def test_sigma_of_a_point_has_the_bend_of_the_map(points):
+def test_sigma_of_a_point_includes_map_deformation(points):
     seen = host(points, 0, points.world.p_w[points.world.visible[0]][:20], observations=np.full(20, 2, np.int32))
     some = edge_map(points, voxel=1e-6)
     some.hosts.append(seen)
@@ -145,7 +145,7 @@ def test_edges_of_one_cell_share_a_prior_near_their_own(points, rng):
     assert len(np.unique(prior)) <= cell.max() + 1 < len(uv)
 
 
-def test_keyframe_without_image_or_partners_is_passed_over(points):
+def test_keyframe_without_image_or_partners_is_skipped(points):
     some = edge_map(points)
     for keyframe in points.keyframes:
         some.announce(keyframe)
@@ -170,7 +170,7 @@ def test_number_of_points_is_bounded(points):
     assert sum(len(h.uv) for h in few.hosts) <= 1
 
 
-def test_bound_that_is_not_reached_changes_nothing(points):
+def test_a_limit_that_is_not_reached_changes_nothing(points):
     some = edge_map(points, max_points=1000)
     some.hosts.append(host(points, 0, points.world.p_w[:300]))
     some._bound()
@@ -243,7 +243,7 @@ def test_edges_do_not_follow_a_handful_of_anchors_nor_the_network(points):
     np.testing.assert_array_equal(after.p_c, before)
 
 
-def test_edges_that_grow_take_along_what_they_follow(points):
+def test_scaled_edges_keep_their_reference_depths(points):
     before, after = followed(points, 1.0)
     after.grow(2.0)
     np.testing.assert_allclose(after.p_c, 2.0 * before, rtol=1e-9)

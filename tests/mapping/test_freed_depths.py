@@ -48,7 +48,7 @@ def turn(angle, x=0.0):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_turn_stays_a_turn(seed):
+def test_a_rotation_gets_no_translation(seed):
     way = {}
     for weights in ([Weight.NONE] * 3, [Weight.WIDE, Weight.EXACT, Weight.EXACT]):
         slam_map, keyframes, window = filmed(np.random.default_rng(seed), [turn(a) for a in (0.0, 0.05, 0.1, 0.15)])
@@ -60,7 +60,7 @@ def test_a_turn_stays_a_turn(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_camera_that_moved_stays_where_it_is(seed):
+def test_a_true_translation_is_preserved(seed):
     """A baseline of a tenth of the depth: nearly every depth is told by the images, which is no reason to move."""
     slam_map, keyframes, window = filmed(np.random.default_rng(seed), [turn(0.0), turn(0.1, 0.2), turn(0.2, 0.4)])
     refine(slam_map, window, CAMERA, LmConfig(max_iterations=30))
@@ -92,7 +92,7 @@ def test_term_is_the_information_of_the_images_on_each_depth(rng):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_shift_that_noise_has_made_is_taken_back(seed):
+def test_a_spurious_translation_is_removed(seed):
     """From the minimum that refinement finds without the term, whose tangent alone is too flat to leave it."""
     slam_map, keyframes, window = filmed(np.random.default_rng(seed), [turn(a) for a in (0.0, 0.05, 0.1, 0.15)])
     lm = LmConfig(max_iterations=30)
@@ -103,7 +103,7 @@ def test_a_shift_that_noise_has_made_is_taken_back(seed):
     assert gone(keyframes) < 0.5 * before
 
 
-def test_nothing_where_images_tell_the_depths(rng):
+def test_no_term_where_images_determine_the_depths(rng):
     slam_map, _, window = filmed(rng, [turn(0.0), turn(0.1, 0.2)])
     slam_map.anchors.from_depth[:] = False
     problem, _ = window_problem(slam_map, replace(window, freed=Weight.EXACT), CAMERA, LmConfig())

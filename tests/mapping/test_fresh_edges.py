@@ -47,7 +47,7 @@ def truth(uv):
     return nearest[v, u]
 
 
-def test_what_is_near_and_what_is_far_is_told_without_a_prior():
+def test_near_and_far_depths_are_measured_without_a_prior():
     uv, z = measured(stereo(board_before_a_wall()))
     true = truth(uv)
     near = true < 1.0
@@ -67,37 +67,37 @@ def test_depth_is_in_the_unit_of_the_poses():
     np.testing.assert_allclose(tripled, 3.0 * z, rtol=1e-3)
 
 
-def test_what_lies_beyond_the_bounds_is_not_told():
+def test_depths_outside_the_bounds_are_not_measured():
     _, z = measured(stereo(board_before_a_wall()), nearest=1.5)
     assert (z > 1.4).all()
 
 
-def test_a_camera_that_has_only_turned_tells_nothing():
+def test_a_rotation_gives_no_depth():
     flight = board_before_a_wall()
     on_the_spot = np.repeat(flight.T_w_c[4:], 5, axis=0)
     assert len(measured(stereo(flight, on_the_spot))[1]) == 0
 
 
 @pytest.mark.parametrize("around", [(), (4,)])
-def test_without_another_view_nothing_is_told(around):
+def test_without_another_view_nothing_is_measured(around):
     uv, z = measured(stereo(board_before_a_wall()), around)
     assert uv.shape == (0, 2)
     assert z.shape == (0,)
 
 
-def test_views_from_the_same_place_do_not_take_the_places_of_those_that_tell():
+def test_views_without_baseline_do_not_displace_others():
     alone, _ = measured(stereo(board_before_a_wall()))
     crowded, _ = measured(stereo(board_before_a_wall()), (4, 4, 4, 4, 0, 1, 2, 3))
     np.testing.assert_array_equal(alone, crowded)
 
 
-def test_a_view_from_far_away_is_not_asked():
+def test_a_view_with_a_long_baseline_is_not_used():
     """From .5 to 2 m the longest baseline is .19 m: the first of these views is .2 m away, the second .15."""
     assert len(measured(stereo(board_before_a_wall()), (0,), nearest=0.5, farthest=2.0)[1]) == 0
     assert len(measured(stereo(board_before_a_wall()), (1,), nearest=0.5, farthest=2.0)[1]) > 10
 
 
-def test_no_depth_is_told_that_half_a_pixel_makes_unsure():
+def test_depths_with_a_large_sigma_are_omitted():
     """Over 5 cm the wall at 3 m is 4.3 px from where it would be infinitely far away: half of one is more than 10 %."""
     _, z = measured(stereo(board_before_a_wall()), (3,))
     assert len(z) > 30

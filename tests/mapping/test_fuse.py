@@ -20,7 +20,7 @@ def in_the_whole_map(points, keyframe):
 
 
 @pytest.mark.parametrize("join", [among_neighbours, in_the_whole_map])
-def test_doubles_become_one(rng, join):
+def test_duplicates_are_merged(rng, join):
     """Half of the points got a second anchor that only the newest two keyframes know."""
     points = PointMap(rng, 300, 4)
     anchor_of = points.fill()
@@ -44,7 +44,7 @@ def test_doubles_become_one(rng, join):
     assert before - len(points.map.anchors) > 0.8 * len(twice)
 
 
-def test_forgotten_observations_are_found_again(rng):
+def test_missing_observations_are_found(rng):
     """Also by keyframes that share nothing any more with those that hold the anchors."""
     points = PointMap(rng, 300, 6)
     points.fill()
@@ -58,7 +58,7 @@ def test_forgotten_observations_are_found_again(rng):
     assert not np.any((last.anchor >= 0) & (last.anchor != held)), "nothing wrong beside it"
 
 
-def test_of_two_anchors_for_one_point_the_better_observed_stays(rng):
+def test_of_duplicates_the_better_observed_anchor_is_kept(rng):
     points = PointMap(rng, 200, 5)
     anchor_of = points.fill()
     observations = points.map.anchors.observations
@@ -76,7 +76,7 @@ def test_of_two_anchors_for_one_point_the_better_observed_stays(rng):
 
 
 @pytest.mark.parametrize(("off_px", "found"), [(2.2, True), (2.8, False)])
-def test_what_lies_beyond_95_percent_is_another_point(rng, off_px, found):
+def test_a_distance_above_the_95_percent_quantile_is_no_duplicate(rng, off_px, found):
     """Two degrees of freedom, one pixel: 2.45 px."""
     points = PointMap(rng, 300, 4)
     points.fill()

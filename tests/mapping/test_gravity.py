@@ -19,23 +19,23 @@ def flight(rng, g=9.81, seconds=4.0, noise=0.5):
     return SpecificForce(stamps_s, felt_c, math.radians(1.0)), stamps_s, T_m_c
 
 
-def test_the_mean_force_is_up(rng):
+def test_the_mean_force_gives_the_vertical(rng):
     up = up_by_gravity(*flight(rng))
     assert math.degrees(math.acos(up.direction @ UP_M)) < 1.0
     assert math.radians(1.0) <= up.sigma_rad < math.radians(3.0)
 
 
 @pytest.mark.parametrize("kwargs", [{"g": 1.0}, {"g": 0.0}, {"seconds": 0.3}])
-def test_what_is_no_gravity_tells_nothing(rng, kwargs):
+def test_a_force_other_than_gravity_gives_nothing(rng, kwargs):
     assert up_by_gravity(*flight(rng, **kwargs)) is None
 
 
-def test_readings_of_another_time_tell_nothing(rng):
+def test_readings_of_another_time_give_nothing(rng):
     force, stamps_s, T = flight(rng)
     assert up_by_gravity(force, stamps_s + 1000.0, T) is None
 
 
-def test_agreeing_evidence_is_joined_and_gravity_wins_a_contradiction():
+def test_consistent_verticals_are_fused_and_gravity_wins_a_contradiction():
     gravity = Up(np.array([0.0, 0.0, 1.0]), math.radians(4.0), "accelerometer")
     near = Up(np.array([0.0, math.sin(0.04), math.cos(0.04)]), math.radians(2.0), "edges")
     both = best_known(gravity, near)

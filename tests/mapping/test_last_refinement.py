@@ -60,7 +60,7 @@ def ate(log: TrajectoryLog) -> float:
 
 
 @pytest.mark.parametrize("name", FORMS)
-def test_every_form_leaves_a_sound_map(name):
+def test_every_form_gives_a_valid_map(name):
     slam_map, edges, log, result = finish(FORMS[name])
     check_map(slam_map)
     assert result.cost_after <= result.cost_before
@@ -69,7 +69,7 @@ def test_every_form_leaves_a_sound_map(name):
     assert ate(log) < 0.02  # of 0.9 m
 
 
-def test_edges_take_part_and_their_depths_go_back_to_the_keyframes():
+def test_edges_are_refined_and_their_depths_written_back():
     _, before, _, points = finish(POINTS)
     _, after, _, both = finish(WindowConfig())
     assert len(points.edge_inverse_depth) == 0
@@ -80,7 +80,7 @@ def test_edges_take_part_and_their_depths_go_back_to_the_keyframes():
     assert np.median(moved[moved > 0]) < 0.03
 
 
-def test_edges_that_were_measured_in_another_scale_follow_the_map():
+def test_edges_measured_at_another_scale_follow_the_map():
     """As after a turn: the refinement of the anchors changes the scale of what was measured before it."""
     slam_map, edges, log = pickle.loads(flight()[0])
     for host in edges.hosts:  # measured when everything was nearer
@@ -107,13 +107,13 @@ def test_edges_measured_with_wrong_poses_are_measured_again():
     assert ate(log) < 0.02
 
 
-def test_without_reprojection_anchors_stay_where_they_are():
+def test_without_reprojection_anchors_are_unchanged():
     start, _, _ = pickle.loads(flight()[0])
     slam_map, _, _, _ = finish(FORMS["no reprojection"])
     np.testing.assert_allclose(slam_map.anchors.p_w, start.anchors.p_w, rtol=0, atol=1e-12)
 
 
-def test_one_anchor_that_is_no_number_costs_the_refinement_and_not_the_map():
+def test_a_non_finite_anchor_skips_the_refinement_and_preserves_the_map():
     slam_map, edges, log = pickle.loads(flight()[0])
     held = int(slam_map.latest().anchor.max())
     slam_map.anchors.p_w[held] = np.nan
@@ -124,7 +124,7 @@ def test_one_anchor_that_is_no_number_costs_the_refinement_and_not_the_map():
     assert len(slam_map.anchors) > 300
 
 
-def test_in_the_last_refinement_telemetry_counts_as_often_as_it_was_heard(monkeypatch):
+def test_the_last_refinement_uses_the_full_weight_of_telemetry(monkeypatch):
     """In each of its rounds, with edges and without: thirty times, as in flight, bends what is straight."""
     flight()
     asked = []
@@ -138,12 +138,12 @@ def test_in_the_last_refinement_telemetry_counts_as_often_as_it_was_heard(monkey
     assert len(asked) >= 3 and set(asked) == {1.0}
 
 
-def test_what_the_forms_mean_while_flying():
+def test_forms_of_the_terms_in_flight():
     assert lm_config(WindowConfig()).kernel is Kernel.HUBER
     assert lm_config(WindowConfig(reprojection="literal")).kernel is Kernel.L2
     assert lm_config(WindowConfig(reprojection="off")).max_iterations == 0
 
 
-def test_a_form_that_is_none_is_refused():
+def test_an_unknown_form_is_rejected():
     with pytest.raises(ValueError, match="cycle must be one of relative, literal, off, got 'pixels'"):
         WindowConfig(cycle="pixels")

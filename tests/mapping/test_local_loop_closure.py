@@ -54,7 +54,7 @@ def drift(rng):
     return small_motion(rng, 0.04, 0.02)
 
 
-def test_returning_camera_is_joined_and_the_drift_goes(rng, drift):
+def test_a_returning_camera_is_matched_and_the_drift_corrected(rng, drift):
     points = drifted(rng, drift)
     last = points.keyframes[5]
     assert revisit_candidate(points.map, last) is points.keyframes[1]
@@ -74,7 +74,7 @@ def test_returning_camera_is_joined_and_the_drift_goes(rng, drift):
     assert np.abs(apart).max() < 0.1 * np.abs(se3.log(drift)).max()
 
 
-def test_another_place_that_looks_different_is_not_joined(rng, drift):
+def test_a_different_place_is_not_matched(rng, drift):
     points = drifted(rng, drift, same_place=False)
     held = points.keyframes[5].anchor.copy()
     assert reobserve(points.map, CAMERA, points.keyframes[5]) is None
@@ -82,7 +82,7 @@ def test_another_place_that_looks_different_is_not_joined(rng, drift):
     np.testing.assert_array_equal(points.keyframes[5].anchor, held)
 
 
-def test_keyframes_that_know_each_other_are_left_alone(rng):
+def test_covisible_keyframes_are_skipped(rng):
     points = PointMap(rng, 300, 4)
     points.fill()
     assert revisit_candidate(points.map, points.keyframes[0]) is None, "none is older"
@@ -97,7 +97,7 @@ def test_keyframe_without_anchors_has_no_revisit_candidate(rng):
     assert revisit_candidate(points.map, points.keyframes[2]) is None
 
 
-def test_a_place_of_which_most_does_not_fit_is_not_joined(rng, drift):
+def test_a_place_with_few_inliers_is_not_matched(rng, drift):
     """Two keypoints in three were moved anywhere nearby: enough of the rest agree, but that is not the place."""
     points = drifted(rng, drift)
     last = points.keyframes[5]

@@ -32,7 +32,7 @@ def anchor_errors(points):
     return np.linalg.norm(points.map.anchors.p_w[ids] - points.world.p_w[point], axis=1), np.array(point)
 
 
-def test_keyframes_grow_a_map_that_is_exact(rng):
+def test_keyframes_build_an_exact_map(rng):
     points = PointMap(rng, 400, 6)
     anchor_of = points.fill([0, 1])
     mapper = make_mapper(points)
@@ -62,7 +62,7 @@ def test_keypoints_of_a_new_keyframe_are_aligned_with_the_views_before_it(rng, s
     assert np.isfinite(points.keyframes[2].aligned_px).any() == sub_pixel
 
 
-def test_pose_error_of_a_new_keyframe_is_refined_away(rng):
+def test_pose_error_of_a_new_keyframe_is_corrected(rng):
     points = PointMap(rng, 400, 5)
     anchor_of = points.fill([0, 1, 2, 3])
     points.keyframes[4].T_c_w = small_motion(rng, 0.01, 0.004) @ points.keyframes[4].T_c_w
@@ -71,7 +71,7 @@ def test_pose_error_of_a_new_keyframe_is_refined_away(rng):
     assert np.abs(se3.log(points.keyframes[4].T_c_w @ se3.inverse(points.world.T_c_w[4]))).max() < 1e-3
 
 
-def test_young_anchors_that_are_not_found_again_go(rng):
+def test_new_anchors_that_are_not_found_again_are_removed(rng):
     points = PointMap(rng, 400, 3)
     anchor_of = points.fill([0, 1])
     mapper = make_mapper(points)
@@ -88,7 +88,7 @@ def test_young_anchors_that_are_not_found_again_go(rng):
     check_map(points.map)
 
 
-def test_a_full_map_loses_keyframes_and_the_window_is_left_alone(rng):
+def test_a_full_map_removes_keyframes_outside_the_window(rng):
     """Thirty cameras in a row: at most twice as many as wanted stay, and the removed ones keep their place."""
     points = PointMap(rng, 300, 30)
     anchor_of = points.fill([0, 1])
@@ -104,7 +104,7 @@ def test_a_full_map_loses_keyframes_and_the_window_is_left_alone(rng):
     assert np.abs([se3.log(t) for t in T]).max() < 0.01
 
 
-def test_the_only_views_of_a_place_stay_in_a_full_map(rng):
+def test_the_only_views_of_a_place_are_kept_in_a_full_map(rng):
     """Two cameras share a place that no other one sees; the others see what others see, too."""
     points = PointMap(rng, 600, 30)
     points.fill()
@@ -119,7 +119,7 @@ def test_the_only_views_of_a_place_stay_in_a_full_map(rng):
     check_map(points.map)
 
 
-def test_a_map_of_only_views_grows_to_twice_the_limit_and_no_further(rng):
+def test_a_map_of_unique_views_grows_to_twice_the_limit(rng):
     points = PointMap(rng, 900, 30)
     points.fill()
     for keyframe in points.keyframes:  # each anchor is left to two neighbours
@@ -130,7 +130,7 @@ def test_a_map_of_only_views_grows_to_twice_the_limit_and_no_further(rng):
     assert len(points.map.keyframes) == 24
 
 
-def test_keyframes_whose_anchors_others_see_go_but_the_first_and_the_last_stay(rng):
+def test_redundant_keyframes_are_removed_except_the_first_and_last(rng):
     """Every point is seen from almost everywhere: of sixteen keyframes a few would do."""
     points = PointMap(rng, 300, 16)
     anchor_of = points.fill([0, 1])
@@ -156,6 +156,6 @@ def test_keyframe_without_covisible_ones_is_inserted(rng):
 
 
 @pytest.mark.parametrize("settings", [{"window": 1}, {"max_keyframes": 10}, {"keyframe_overlap": 1.0}])
-def test_settings_out_of_range_are_refused(settings):
+def test_settings_out_of_range_are_rejected(settings):
     with pytest.raises(ValueError, match="must be"):
         MappingConfig(**settings)

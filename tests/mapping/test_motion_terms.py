@@ -78,7 +78,7 @@ def far(points):
 
 @pytest.mark.parametrize("factor", [0.7, 1.4])
 @pytest.mark.parametrize("scale", [1.0, 3.0])
-def test_scale_is_carried_over_to_what_shares_no_anchor(rng, halves, factor, scale):
+def test_scale_is_preserved_without_shared_anchors(rng, halves, factor, scale):
     blow_up(halves, factor)
     off = far(halves)
     window = Window(halves.keyframes[3:], halves.keyframes[:3], halves.map.anchors_seen_by(halves.keyframes))
@@ -89,7 +89,7 @@ def test_scale_is_carried_over_to_what_shares_no_anchor(rng, halves, factor, sca
     check_map(halves.map)
 
 
-def test_the_recent_map_takes_back_a_drift_that_a_window_holds(rng, halves):
+def test_the_recent_map_corrects_a_drift_that_a_window_preserves(rng, halves):
     blow_up(halves, 1.4)
     window = recent_map(halves.map, halves.keyframes[-1], 60)
     assert ([k.id for k in window.free], [k.id for k in window.fixed]) == ([1, 2, 3, 4, 5], [0])
@@ -102,7 +102,7 @@ def test_the_recent_map_takes_back_a_drift_that_a_window_holds(rng, halves):
 
 
 @pytest.mark.parametrize("most", [16, 60])
-def test_a_drift_that_is_taken_back_leaves_older_keyframes_their_size(rng, most):
+def test_correcting_a_drift_preserves_the_scale_of_older_keyframes(rng, most):
     """The newest keyframes are half as large again: they shrink, and the older ones do not grow towards them."""
     points, split = PointMap(rng, 600, 20), 14
     points.fill()
@@ -138,7 +138,7 @@ def back(keyframes, earlier, last, reach=0.0):
     return is_back(keyframes[:earlier], keyframes[earlier:last], np.full(last, reach))
 
 
-def test_a_camera_is_back_where_a_place_was_out_of_view(there_and_back):
+def test_a_revisit_follows_a_loss_of_view(there_and_back):
     keyframes = there_and_back.keyframes
     assert back(keyframes, 6, 12)
     assert back(keyframes, 6, 9)
@@ -152,14 +152,14 @@ def test_a_camera_is_back_where_a_place_was_out_of_view(there_and_back):
     assert not back(keyframes, 6, 12), "too few anchors in common"
 
 
-def test_a_camera_that_only_turned_is_not_back(there_and_back):
+def test_a_rotation_is_no_revisit(there_and_back):
     keyframes = there_and_back.keyframes
     way = max(np.linalg.norm(keyframes[8].centre_w - k.centre_w) for k in keyframes[4:8])
     assert not back(keyframes, 6, 12, 1.01 * way)
     assert back(keyframes, 6, 12, 0.99 * way)
 
 
-def test_a_camera_that_turned_elsewhere_before_is_not_back(there_and_back):
+def test_an_earlier_rotation_elsewhere_is_no_revisit(there_and_back):
     """It turns where it begins, flies on with the place in view, and turns again."""
     keyframes = there_and_back.keyframes
     keyframes[1].anchor[:] = NO_ANCHOR
@@ -169,7 +169,7 @@ def test_a_camera_that_turned_elsewhere_before_is_not_back(there_and_back):
     assert not back(keyframes, 4, 12, 1.0)
 
 
-def test_a_place_that_fades_was_not_out_of_view(there_and_back):
+def test_a_slowly_vanishing_view_is_no_loss_of_view(there_and_back):
     keyframes = there_and_back.keyframes
     common = reduce(np.intersect1d, [k.anchor[k.anchor >= 0] for k in keyframes[:4]])
     for few in (3, MIN_SHARED // 2):
@@ -178,7 +178,7 @@ def test_a_place_that_fades_was_not_out_of_view(there_and_back):
         assert back(keyframes, 4, 12) == (few == 3)
 
 
-def test_known_ground_does_not_follow_telemetry(there_and_back):
+def test_a_revisited_map_does_not_follow_telemetry(there_and_back):
     newest = there_and_back.keyframes
     assert recent_map(there_and_back.map, newest[-1], 6) is not None, "it only turned"
     for keyframe in newest[4:8]:
@@ -194,7 +194,7 @@ def spread_of(points, first, last):
     return np.ptp(np.array([k.centre_w for k in points.keyframes[first:last]]), axis=0).max()
 
 
-def test_only_two_keyframes_or_a_camera_that_stood_are_no_recent_map(halves):
+def test_two_keyframes_or_a_static_camera_are_no_recent_map(halves):
     newest = halves.keyframes[-1]
     assert recent_map(halves.map, newest, 2).fixed
     for keyframe in halves.keyframes:
@@ -227,14 +227,14 @@ def test_every_few_keyframes_the_recent_map_is_refined_with_telemetry(rng, metre
     assert 1.0 < drift < 1.25 if metres else drift > 1.35  # half of it at the first time
 
 
-def test_pieces_are_not_tied_to_each_other(rng, halves):
+def test_factors_do_not_connect_submaps(rng, halves):
     model = telemetry_of(rng, halves)
     factors = motion_factors(model, halves.keyframes, [0, 0, 0, 1, 1, 1])
     assert [f.pose.tolist() for f in factors.centres] == [[0, 1, 2], [3, 4, 5]]
     assert [f.pose.tolist() for f in factors.gravity] == [[0, 1, 2], [3, 4, 5]]
 
 
-def test_keyframes_of_earlier_flights_have_no_time_on_this_clock(rng, halves):
+def test_loaded_keyframes_have_no_stamp_on_this_clock(rng, halves):
     model = telemetry_of(rng, halves)
     halves.keyframes[0].stamp_s = -np.inf
     told = motion_factors(model, halves.keyframes, [0] * 6)
@@ -271,7 +271,7 @@ def tilt_deg(points):
 
 
 @pytest.mark.parametrize("turn_rad", [0.15, -0.15])
-def test_a_part_that_has_turned_is_turned_back_by_the_drones_heading(rng, halves, turn_rad):
+def test_heading_corrects_a_rotated_part_of_the_map(rng, halves, turn_rad):
     """The last three keyframes and what they alone see, turned about the vertical through the third: positions alone
     would move them back and leave them turned."""
     turned_about(halves, [0.0, 0.0, turn_rad])
@@ -301,14 +301,14 @@ def heading_deg(points, first=3):
     return float(np.degrees(np.mean(Rotation.from_matrix(np.array(off)).as_rotvec()[:, 2])))
 
 
-def test_headings_say_nothing_before_metres_or_where_attitude_may_not_speak(rng, halves):
+def test_headings_need_a_metric_scale_and_valid_attitude(rng, halves):
     model = telemetry_of(rng, halves)
     assert motion_factors(model, halves.keyframes, [0] * 6).headings
     for silent in (replace(model, attitude=False), replace(model, scale_sigma_log=np.inf, velocity=False)):
         assert not motion_factors(silent, halves.keyframes, [0] * 6).headings
 
 
-def test_gravity_alone_holds_level_what_nothing_else_holds(rng, halves):
+def test_gravity_alone_levels_an_unconstrained_map(rng, halves):
     tilted(halves, 0.2)
     assert tilt_deg(halves) > 10.0
     model = replace(telemetry_of(rng, halves), velocity=False)
@@ -318,14 +318,14 @@ def test_gravity_alone_holds_level_what_nothing_else_holds(rng, halves):
     assert tilt_deg(halves) < 0.5
 
 
-def test_gravity_weighs_against_a_window_as_the_rest_of_telemetry_does(rng, halves):
+def test_gravity_has_the_weight_of_other_telemetry(rng, halves):
     """Keyframes a second apart: three are within half of the 5 s that an error of attitude lasts."""
     model = telemetry_of(rng, halves)
     (gravity,) = motion_factors(model, halves.keyframes, [0] * 6).gravity
     assert np.degrees(gravity.sigma_rad) == pytest.approx(2.0 * np.sqrt(5.0) / np.sqrt(30.0), rel=0.15)
 
 
-def test_gravity_decides_in_a_young_map_while_nothing_has_told_metres(rng, halves):
+def test_gravity_dominates_in_a_new_map_without_metric_scale(rng, halves):
     """Then depths are guesses: a third of a degree is worth less than the attitude of a drone, and not after that."""
     model = telemetry_of(rng, halves)
     (before,), (after,) = (
@@ -335,7 +335,7 @@ def test_gravity_decides_in_a_young_map_while_nothing_has_told_metres(rng, halve
     assert np.degrees(before.sigma_rad) < 0.1 < 0.5 < np.degrees(after.sigma_rad)
 
 
-def test_a_whole_map_may_count_telemetry_as_often_as_it_was_heard(rng, halves):
+def test_a_whole_map_may_use_the_full_weight_of_telemetry(rng, halves):
     """In a window of the flight 120 times, beside keypoints that err together; attitude thirty times."""
     model, keyframes = telemetry_of(rng, halves), halves.keyframes
     flying = Window(keyframes[1:], keyframes[:1], halves.map.anchors_seen_by(keyframes))
@@ -350,7 +350,7 @@ def test_a_whole_map_may_count_telemetry_as_often_as_it_was_heard(rng, halves):
     np.testing.assert_allclose(30.0 * one.headings[0].information, often.headings[0].information)
 
 
-def test_attitude_that_may_not_speak_gives_no_gravity(rng, halves):
+def test_invalid_attitude_gives_no_gravity(rng, halves):
     model = replace(telemetry_of(rng, halves), attitude=False)
     factors = motion_factors(model, halves.keyframes, [0] * 6)
     assert factors.centres and not factors.gravity
@@ -362,7 +362,7 @@ def test_no_telemetry_no_factors(halves):
 
 
 @pytest.mark.parametrize("metres", [1.0, 0.2])
-def test_a_keyframe_that_hangs_on_its_neighbour_alone_stays_where_a_camera_can_have_been(rng, metres):
+def test_a_weakly_connected_keyframe_stays_at_a_plausible_pose(rng, metres):
     """The first of six, a fifth of a second apart: nothing else sees what it shares with the second one."""
     points = PointMap(rng, 400, 6)
     points.fill()

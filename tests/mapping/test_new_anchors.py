@@ -40,12 +40,12 @@ def test_matches_are_right_and_nearly_complete(points, rng):
     assert len(matches) > 0.7 * common
 
 
-def test_prior_that_is_far_off_finds_nothing_wrong(points):
+def test_a_wrong_prior_gives_no_wrong_matches(points):
     matches = matched(points, 20.0 * depth_of(points, 0), 0.1)
     assert len(matches) < 0.05 * len(points.point_of[0])
 
 
-def test_keypoints_that_have_an_anchor_are_left_alone(points):
+def test_keypoints_with_an_anchor_are_skipped(points):
     points.fill()
     assert len(matched(points, depth_of(points, 0))) == 0
 
@@ -64,7 +64,7 @@ def test_triangulated_points_are_exact(points):
     assert np.isfinite(sigma).all()
 
 
-def test_sigma_along_the_ray_is_what_noise_does(rng):
+def test_sigma_along_the_ray_matches_the_noise(rng):
     points = PointMap(rng, 2000, 3, noise_px=1.0)
     matches = matched(points, depth_of(points, 0))
     p_w, sigma, used = triangulated(points, matches)
@@ -83,23 +83,23 @@ def test_wrong_pairs_do_not_triangulate(points, rng):
     assert len(used) < 0.05 * len(query)
 
 
-def test_too_little_parallax_is_refused(points):
+def test_too_little_parallax_is_rejected(points):
     matches = matched(points, depth_of(points, 0))
     assert len(triangulated(points, matches, 60.0)[2]) == 0
 
 
-def test_nothing_in_nothing_out(points):
+def test_empty_input_gives_empty_output(points):
     p_w, sigma, used = triangulated(points, EMPTY)
     assert (p_w.shape, sigma.shape, used.shape) == ((0, 3), (0,), (0,))
 
 
-def test_level_that_contradicts_the_distance_is_refused(points):
+def test_a_level_that_contradicts_the_distance_is_rejected(points):
     matches = matched(points, depth_of(points, 0))
     points.keyframes[1].features.octave[:] = 6
     assert len(triangulated(points, matches)[2]) == 0
 
 
-def test_a_twin_off_the_epipolar_line_is_not_matched(points, rng):
+def test_a_similar_keypoint_off_the_epipolar_line_is_not_matched(points, rng):
     """Six pixels beside every keypoint sits one with the very descriptor; the right one differs in 20 bits."""
     a, b = points.keyframes[0], points.keyframes[1]
     T = b.T_c_w @ se3.inverse(a.T_c_w)

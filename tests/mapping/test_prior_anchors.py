@@ -51,7 +51,7 @@ def on_priors(points, error, sigma_log=0.3):
 # -- depth of a match under a prior ----------------------------------------------------------------------------------
 
 
-def test_without_baseline_the_prior_is_the_answer():
+def test_without_baseline_the_result_is_the_prior():
     T = se3.exp(np.array([0.0, 0.0, 0.0, 0.02, -0.05, 0.01]))
     prior = prior_of(np.array([1.5, 4.0, 5.0]), np.array([0.3, 0.2, 0.5]))
     found, chi2 = inverse_depth_with_prior(*seen_from(T), np.ones(3), T, CAMERA, prior)
@@ -59,7 +59,7 @@ def test_without_baseline_the_prior_is_the_answer():
     np.testing.assert_allclose(chi2, 0.0, atol=1e-9)
 
 
-def test_with_a_long_baseline_the_images_are_the_answer():
+def test_with_a_long_baseline_images_determine_the_result():
     T = se3.exp(np.array([0.5, 0.1, 0.0, 0.0, 0.1, 0.0]))
     prior = prior_of(1.3 * POINTS[:, 2], np.full(3, 0.5))
     ray, uv = seen_from(T)
@@ -69,7 +69,7 @@ def test_with_a_long_baseline_the_images_are_the_answer():
     assert (chi2 < 0.1).all()
 
 
-def test_in_between_it_is_the_minimum_of_both_costs():
+def test_the_result_minimises_the_sum_of_both_costs():
     """One point, one pixel of parallax: compare with the minimum found by trying."""
     T = se3.exp(np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0]))
     ray, uv = seen_from(T, noise=0.4)
@@ -95,7 +95,7 @@ def test_a_wrong_match_does_not_reproject():
 # -- in the window ---------------------------------------------------------------------------------------------------
 
 
-def test_refinement_takes_wrong_priors_to_the_truth_where_there_is_parallax(points):
+def test_refinement_corrects_wrong_priors_with_parallax(points):
     ids = on_priors(points, error=1.15)
     seen = points.map.anchors.observations[ids] >= 3
     window = Window(points.keyframes[2:], points.keyframes[:2], points.map.anchors_seen_by(points.keyframes))
@@ -108,7 +108,7 @@ def test_refinement_takes_wrong_priors_to_the_truth_where_there_is_parallax(poin
     assert alive.sum() > 50
 
 
-def test_a_host_outside_the_window_still_holds_its_anchors(points):
+def test_a_host_outside_the_window_constrains_its_anchors(points):
     ids = on_priors(points, error=1.0)
     keyframes = points.keyframes[1:]
     priors, hosts = depth_priors(points.map, ids, [k.id for k in keyframes])
@@ -123,7 +123,7 @@ def test_a_window_without_such_anchors_has_no_priors(points):
     assert depth_priors(points.map, window, [0, 1, 2, 3]) == (None, [])
 
 
-def test_parallax_frees_an_anchor_of_its_prior(points):
+def test_parallax_drops_the_prior_of_an_anchor(points):
     ids = on_priors(points, error=1.0)
     other = points.keyframes[3]
     drop_needless_priors(points.map, points.keyframes[0], np.deg2rad(1.0))
@@ -151,7 +151,7 @@ def test_slack_is_what_a_depth_error_of_one_sigma_moves_the_pixel_by(points):
     np.testing.assert_allclose(slack[front], expected[front], rtol=0.05, atol=0.01)
 
 
-def test_a_camera_that_only_turned_has_no_slack(points):
+def test_a_rotation_has_no_slack(points):
     ids = on_priors(points, error=1.0)
     turned = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.1])) @ points.world.T_c_w[0]
     np.testing.assert_allclose(depth_slack_px(points.map.anchors, ids, turned, CAMERA), 0.0, atol=1e-6)
@@ -166,7 +166,7 @@ def test_triangulated_anchors_have_no_slack(points):
     assert mostly_on_priors(points.map.anchors, ids)
 
 
-def test_no_network_is_believed_to_better_than_half_of_its_depth():
+def test_sigma_of_predicted_depth_is_at_least_half():
     """Whatever sigma it states: inverse depth 1 / z, and at least half of that for its standard deviation."""
     prior = prior_of(np.array([2.0, 4.0, 4.0]), np.array([0.05, 0.3, 0.8]))
     np.testing.assert_allclose(prior, [[0.5, 0.25], [0.25, 0.125], [0.25, 0.2]])

@@ -34,7 +34,7 @@ def pose_errors(points, keyframes):
 
 
 @pytest.mark.parametrize(("free", "fixed"), [(3, 2), (4, 15), (10, 15)])
-def test_two_keyframes_at_least_hold_the_gauge(points, free, fixed):
+def test_at_least_two_keyframes_fix_the_gauge(points, free, fixed):
     newest = points.keyframes[-1]
     window = choose_window(points.map, newest, free, fixed)
     assert newest in window.free
@@ -44,7 +44,7 @@ def test_two_keyframes_at_least_hold_the_gauge(points, free, fixed):
     np.testing.assert_array_equal(window.anchor, points.map.anchors_seen_by(window.free))
 
 
-def test_disturbed_window_comes_back_exactly(points, rng):
+def test_a_disturbed_window_is_recovered_exactly(points, rng):
     window = choose_window(points.map, points.keyframes[-1], 4, 15)
     for keyframe in window.free:
         keyframe.T_c_w = small_motion(rng, 0.02, 0.01) @ keyframe.T_c_w
@@ -56,7 +56,7 @@ def test_disturbed_window_comes_back_exactly(points, rng):
 
 
 @pytest.mark.parametrize("what", ["anchor", "pixel"])
-def test_a_window_that_cannot_be_refined_is_left_as_it_is(points, what):
+def test_a_window_that_cannot_be_refined_is_unchanged(points, what):
     """A NaN in the solver's result leaves poses, anchors and observations unchanged."""
     window = choose_window(points.map, points.keyframes[-1], 4, 15)
     if what == "anchor":
@@ -73,7 +73,7 @@ def test_a_window_that_cannot_be_refined_is_left_as_it_is(points, what):
 
 
 @pytest.mark.parametrize(("kernel", "sigma_px"), [(Kernel.HUBER, 1.2**3), (Kernel.L2, 1.0)])
-def test_keypoints_count_as_precisely_as_their_level_tells(points, kernel, sigma_px):
+def test_keypoints_are_weighted_by_their_pyramid_level(points, kernel, sigma_px):
     """A keypoint of level 3 scatters by 1.728 px; in the paper's plain squares all count effective_samples."""
     window = choose_window(points.map, points.keyframes[-1], 4, 15)
     coarse = points.keyframes[-1]
@@ -86,7 +86,7 @@ def test_keypoints_count_as_precisely_as_their_level_tells(points, kernel, sigma
     np.testing.assert_allclose(problem.inv_sigma[~mine], 1.0)
 
 
-def test_an_aligned_keypoint_counts_as_precisely_as_its_alignment(points):
+def test_aligned_keypoints_are_weighted_by_their_alignment(points):
     window = choose_window(points.map, points.keyframes[-1], 4, 15)
     newest = points.keyframes[-1]
     newest.features.octave[:] = 3
@@ -97,7 +97,7 @@ def test_an_aligned_keypoint_counts_as_precisely_as_its_alignment(points):
     np.testing.assert_allclose(1.0 / problem.inv_sigma[problem.obs_pose == pose], expected)
 
 
-def test_wrong_observations_are_taken_out_of_the_map(points, rng):
+def test_outlier_observations_are_removed_from_the_map(points, rng):
     keyframe = points.keyframes[-1]
     wrong = rng.permutation(keyframe.keypoints_with_anchor())[:20]
     keyframe.features.uv[wrong] += 30.0
@@ -112,7 +112,7 @@ def test_wrong_observations_are_taken_out_of_the_map(points, rng):
     check_map(points.map)
 
 
-def test_half_way_no_observation_is_taken_for_a_wrong_one(points, rng):
+def test_no_observation_is_removed_before_convergence(points, rng):
     """The solver runs out of steps far from the minimum, where right observations do not fit either."""
     keyframe = points.keyframes[-1]
     keyframe.T_c_w = small_motion(rng, 0.3, 0.1) @ keyframe.T_c_w
@@ -125,7 +125,7 @@ def test_half_way_no_observation_is_taken_for_a_wrong_one(points, rng):
     check_map(points.map)
 
 
-def test_a_wide_window_is_taken_at_its_minimum_only(points, rng):
+def test_a_wide_window_is_written_back_only_if_converged(points, rng):
     for keyframe in points.keyframes[1:]:
         keyframe.T_c_w = small_motion(rng, 0.3, 0.1) @ keyframe.T_c_w
     before = [k.T_c_w.copy() for k in points.keyframes]
@@ -157,7 +157,7 @@ def test_nothing_to_refine(points):
     assert refine(points.map, Window([lonely], [], np.zeros(0, np.int64)), CAMERA, LmConfig()) is None
 
 
-def test_whole_map_comes_back_up_to_its_gauge(points, rng):
+def test_the_whole_map_is_recovered_up_to_its_gauge(points, rng):
     """The first pose and the distance to the farthest keyframe are held, the rest is free."""
     first, far = points.keyframes[0], points.keyframes[-1]
     for keyframe in points.keyframes[1:-1]:
@@ -172,7 +172,7 @@ def test_whole_map_comes_back_up_to_its_gauge(points, rng):
     check_map(points.map)
 
 
-def test_the_unit_of_an_earlier_flight_stays_as_it_was(points):
+def test_the_scale_of_a_loaded_map_is_preserved(points):
     """What this flight adds is a tenth too far off: it comes to the earlier map, not the other way round."""
     earlier, later = points.keyframes[:3], points.keyframes[3:]
     origin = earlier[0].centre_w
@@ -188,13 +188,13 @@ def test_the_unit_of_an_earlier_flight_stays_as_it_was(points):
     check_map(points.map)
 
 
-def test_map_of_two_keyframes_is_left_alone(rng):
+def test_map_of_two_keyframes_is_not_refined(rng):
     points = PointMap(rng, 100, 2)
     points.fill()
     assert refine_all(points.map, CAMERA, LmConfig()) is None
 
 
-def test_map_of_a_camera_that_never_moved_is_left_alone(points):
+def test_map_of_a_static_camera_is_not_refined(points):
     """Zero extent cannot fix the gauge; this once divided by zero on a folder of images from one place."""
     for keyframe in points.map.keyframes.values():
         keyframe.T_c_w = np.eye(4)
@@ -229,7 +229,7 @@ def median_depth(points):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_young_map_of_a_wrong_shape_is_straightened(seed):
+def test_a_new_map_of_a_wrong_shape_is_corrected(seed):
     """Where one pose and one distance are held, and the solver does not stop early."""
     points = PointMap(np.random.default_rng(seed), 300, 6, noise_px=0.3)
     points.fill()
@@ -243,7 +243,7 @@ def test_a_young_map_of_a_wrong_shape_is_straightened(seed):
     check_map(points.map)
 
 
-def test_a_young_map_is_all_of_it_held_by_what_was_refined_before(points, rng):
+def test_the_scale_of_a_new_map_is_fixed_by_refined_poses(points, rng):
     """The newest keyframe, the farthest one, comes as tracking placed it: its error must not become the map's scale."""
     newest, centre = points.keyframes[-1], points.keyframes[0].centre_w
     distance = [np.linalg.norm(k.centre_w - centre) for k in points.keyframes]
@@ -255,7 +255,7 @@ def test_a_young_map_is_all_of_it_held_by_what_was_refined_before(points, rng):
     np.testing.assert_allclose(after, distance, rtol=2e-3, atol=1e-6)
 
 
-def test_only_a_small_map_is_young(points):
+def test_only_a_small_map_is_new(points):
     newest = points.keyframes[-1]
     assert young_map(points.map, newest, len(points.keyframes)).free[-1] is newest
     assert young_map(points.map, newest, len(points.keyframes) - 1) is None

@@ -68,7 +68,7 @@ def agree(cloud, points):
     return np.allclose(cloud.p_w, numbered(points)[cloud.colour[:, 0]], atol=1e-3)
 
 
-def test_edges_that_are_thinned_while_they_are_read_stay_whole(slam, points, monkeypatch):
+def test_concurrent_thinning_does_not_affect_read_edges(slam, points, monkeypatch):
     pose_of = slam.map.pose_of
     thin = np.arange(30) % 2 == 0
 
@@ -81,7 +81,7 @@ def test_edges_that_are_thinned_while_they_are_read_stay_whole(slam, points, mon
     assert agree(slam.edge_map(), points)
 
 
-def test_edges_that_are_read_while_they_are_thinned_are_not_half_thinned(slam, points):
+def test_concurrent_reading_never_sees_partly_thinned_edges(slam, points):
     seen = []
 
     class Thinned(EdgePoints):
@@ -99,7 +99,7 @@ def test_edges_that_are_read_while_they_are_thinned_are_not_half_thinned(slam, p
     assert agree(slam.edge_map(), points)
 
 
-def test_anchors_that_are_replaced_while_they_are_read_are_the_old_ones_or_the_new_ones(slam):
+def test_concurrent_replacement_of_anchors_is_atomic(slam):
     anchors = slam.map.anchors
     alive = np.flatnonzero(anchors.alive)
     anchors.colour[alive] = 1
@@ -121,7 +121,7 @@ def test_anchors_that_are_replaced_while_they_are_read_are_the_old_ones_or_the_n
     assert np.unique(cloud.colour).tolist() == np.unique(cloud.sigma_m).tolist()
 
 
-def test_a_keyframe_that_is_removed_while_they_are_listed_is_listed_or_not(slam):
+def test_concurrent_removal_of_a_keyframe_is_atomic(slam):
     last = slam.map.keyframes[2]
 
     class Meddled(dict):

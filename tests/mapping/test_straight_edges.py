@@ -42,7 +42,7 @@ def turned(segments, R):
 
 @pytest.mark.parametrize("pitch_deg, roll_deg", [(0.0, 0.0), (-40.0, 0.0), (-30.0, 25.0), (15.0, -25.0)])
 @pytest.mark.parametrize("verticals", [0.0, 0.3])
-def test_a_room_tells_where_up_is_however_the_map_leans(rng, pitch_deg, roll_deg, verticals):
+def test_a_room_gives_the_vertical_of_a_tilted_map(rng, pitch_deg, roll_deg, verticals):
     R_m_w = Rotation.from_euler("xyz", [0.6, -0.3, 1.0]).as_matrix()
     R_w_c = cameras(pitch_deg=pitch_deg, roll_deg=roll_deg)
     up = vertical(turned(room(rng, verticals=verticals), R_m_w), R_m_w @ R_w_c)
@@ -52,17 +52,17 @@ def test_a_room_tells_where_up_is_however_the_map_leans(rng, pitch_deg, roll_deg
 
 
 @pytest.mark.parametrize("roll_deg", [90.0, -90.0, 80.0])
-def test_a_turned_phone_is_not_taken_for_a_tilted_room(rng, roll_deg):
+def test_a_rotated_phone_gives_no_tilted_vertical(rng, roll_deg):
     assert vertical(room(rng), cameras(roll_deg=roll_deg)) is None
 
 
-def test_clutter_tells_nothing(rng):
+def test_clutter_gives_no_vertical(rng):
     assert vertical(room(rng, clutter=1.0, verticals=0.0), cameras()) is None
 
 
-def test_a_guessed_lens_is_not_relied_on(rng):
+def test_an_uncertain_focal_length_increases_sigma_or_rejects(rng):
     assert vertical(room(rng), cameras(), focal_sigma=0.45) is None
 
 
-def test_few_segments_tell_nothing(rng):
+def test_few_segments_give_no_vertical(rng):
     assert vertical(room(rng, per_keyframe=1), cameras()) is None

@@ -52,14 +52,14 @@ def refined(rng, tracked):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_turn_stays_a_turn(seed):
+def test_a_rotation_gets_no_translation(seed):
     alone = shift(refined(np.random.default_rng(seed), tracked=False))
     held = shift(refined(np.random.default_rng(seed), tracked=True))
     assert alone > 0.03, "what depths that follow the noise make of it"
     assert held < 0.5 * alone
 
 
-def test_a_motion_holds_while_most_depths_rest_on_priors(rng):
+def test_motion_priors_apply_while_most_depths_have_priors(rng):
     slam_map, keyframes, ids = turning(rng)
     keyframes[2].tracked = tracked_motion(keyframes[1], keyframes[2].T_c_w, SIGMA**2 * np.eye(6))
     (prior,) = tracked_motions(slam_map, keyframes)
@@ -72,12 +72,12 @@ def test_a_motion_holds_while_most_depths_rest_on_priors(rng):
 
 
 @pytest.mark.parametrize("covariance", [np.full((6, 6), np.inf), np.zeros((6, 6))])
-def test_a_motion_of_unknown_precision_is_none(rng, covariance):
+def test_a_motion_without_covariance_gives_no_prior(rng, covariance):
     _, keyframes, _ = turning(rng)
     assert tracked_motion(keyframes[0], keyframes[1].T_c_w, covariance) is None
 
 
-def test_a_motion_grows_with_its_map(rng):
+def test_a_motion_is_scaled_with_its_map(rng):
     """Twice the map: twice the way, and a tangent of twice the translation is as likely as before."""
     _, keyframes, _ = turning(rng)
     T = se3.exp(np.array([0.1, 0.0, -0.2, 0.0, 0.1, 0.0]))

@@ -41,7 +41,7 @@ def flying(edges: EdgeMap, config: WindowConfig = ALWAYS) -> WindowEdges:
     return WindowEdges(edges, CAMERA, terms, flying=True)
 
 
-def test_edges_join_where_corners_are_few():
+def test_edges_are_used_with_few_corners():
     slam_map, edges = state()
     rich = slam_map.latest()
     assert np.count_nonzero(rich.anchor >= 0) >= FEW_ANCHORS
@@ -54,7 +54,7 @@ def test_edges_join_where_corners_are_few():
     assert WindowConfig(in_flight="off").flying is None
 
 
-def test_free_keyframes_bring_edges_and_unmeasured_ones_are_partners():
+def test_free_keyframes_have_edges_and_unmeasured_ones_are_targets():
     slam_map, edges = state()
     window = choose_window(slam_map, slam_map.latest(), 4, 15)
     keyframes = [*window.free, *window.fixed]
@@ -74,7 +74,7 @@ def test_free_keyframes_bring_edges_and_unmeasured_ones_are_partners():
     assert np.bincount(terms.host).max() <= ALWAYS.in_flight_edges
 
 
-def test_a_disturbed_pose_comes_back_by_edges_alone():
+def test_a_disturbed_pose_is_recovered_by_edges_alone():
     slam_map, edges = state()
     window = choose_window(slam_map, slam_map.latest(), 4, 15)
     moved = next(k for k in window.free if k.id in {h.keyframe_id for h in edges.hosts})
@@ -91,7 +91,7 @@ def test_a_disturbed_pose_comes_back_by_edges_alone():
     assert abs(moved.T_c_w[0, 3] - true[0, 3]) < 0.005
 
 
-def test_depths_go_back_to_the_keyframes_and_are_read_anew():
+def test_depths_are_written_back_and_updated():
     slam_map, edges = state()
     window = choose_window(slam_map, slam_map.latest(), 4, 15)
     terms, depth = flying(edges), {h.keyframe_id: h.p_c[:, 2].copy() for h in edges.hosts}
@@ -116,14 +116,14 @@ def test_depths_go_back_to_the_keyframes_and_are_read_anew():
         (("collinearity",), False, "off", "off", "relative"),
     ],
 )
-def test_losses_of_the_flying_windows_are_chosen_one_by_one(losses, alignment, cycle, angle, collinearity):
+def test_losses_in_flight_are_selected_individually(losses, alignment, cycle, angle, collinearity):
     terms = WindowConfig(in_flight_losses=losses).flying
     assert terms is not None
     assert (terms.alignment, terms.cycle, terms.angle, terms.collinearity) == (alignment, cycle, angle, collinearity)
     assert terms.edges_per_keyframe == terms.in_flight_edges
 
 
-def test_forms_chosen_for_the_end_hold_while_flying_and_unknown_losses_are_refused():
+def test_forms_apply_in_flight_and_unknown_losses_are_rejected():
     terms = WindowConfig(cycle="literal").flying
     assert terms is not None
     assert term_config(terms).cycle_px

@@ -95,7 +95,7 @@ def test_terms_fit_at_the_true_poses(scene):
     assert result.cost_after < 0.7 * (len(edges.pair_edge) + 4 * len(junctions.pair_junction))
 
 
-def test_numbers_are_kept(scene):
+def test_limits_of_terms_apply(scene):
     T, structures = scene
     placed = edge_terms(structures, T, K, TermConfig(edges_per_pose=100, targets=1))
     assert placed is not None
@@ -104,7 +104,7 @@ def test_numbers_are_kept(scene):
     assert np.bincount(edges.pair_edge).max() == 1
 
 
-def test_terms_bring_poses_back(scene, rng):
+def test_terms_recover_poses(scene, rng):
     T, structures = scene
     start = T.copy()
     for i in (1, 2, 3):
@@ -126,7 +126,7 @@ def test_terms_bring_poses_back(scene, rng):
     assert after < 0.4 * before
 
 
-def test_a_corner_whose_arms_run_another_way_is_another_corner(scene):
+def test_a_corner_with_other_arm_directions_is_not_matched(scene):
     """At the right pixels, but turned by 60 degrees: what one view sees there the others do not."""
     T, structures = scene
     true = junction_terms(structures, T, K)
@@ -139,7 +139,7 @@ def test_a_corner_whose_arms_run_another_way_is_another_corner(scene):
     assert pairs[1] < 0.1 * pairs[0]
 
 
-def test_nothing_to_pair_gives_none(scene):
+def test_no_pairs_give_none(scene):
     T, structures = scene
     bare = Structure(structures[0].field, structures[0].sigma)
     far = np.stack([np.eye(4), se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))])

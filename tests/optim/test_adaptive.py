@@ -29,7 +29,7 @@ def test_residuals_of_a_clean_window_are_zero():
         assert float(np.abs(r).max()) < 1e-6, name
 
 
-def test_scales_find_the_noise_that_was_put_in():
+def test_scales_match_the_added_noise():
     problem = at_truth(2, Noise(px=0.7, depth=0.1))
     found = {k: float(robust_sigma(r)) for k, r in term_residuals(problem).items()}
     assert found["reproj"] == pytest.approx(1.0, abs=0.1)  # whitened by its 0.7 px already
@@ -102,6 +102,6 @@ def test_scale_is_smooth_clamped_and_unmoved_by_few():
 
 
 @pytest.mark.parametrize("low, sigma, high", [(0.0, 1.0, 2.0), (1.0, 0.5, 2.0), (1.0, 3.0, 2.0)])
-def test_scale_refuses_a_wrong_range(low, sigma, high):
+def test_scale_rejects_an_invalid_range(low, sigma, high):
     with pytest.raises(ValueError, match="low <= sigma"):
         TermScale(sigma, low, high)

@@ -85,7 +85,7 @@ def test_at_the_true_pose_nearly_all_edges_find_a_partner_within_a_pixel(rng):
     assert (pairs.pair_pose == 1).all()
 
 
-def test_edges_that_run_the_other_way_are_no_partners(rng):
+def test_edges_of_another_direction_are_no_partners(rng):
     T, fields = two_views(rng)
     edges = fields[1].edges
     flipped = edge_field(replace(edges, normal=-edges.normal), fields[1].inverse_depth, SIZE)
@@ -118,7 +118,7 @@ def test_no_edges_no_pairs(rng):
     assert len(pairs_of(T, [fields[0], edge_field(empty, np.zeros(0), SIZE)]).pair_edge) == 0
 
 
-def test_edges_alone_bring_a_pose_back(rng):
+def test_edges_alone_recover_a_pose(rng):
     T, fields = two_views(rng)
     edges, depth = fields[0].edges, fields[0].inverse_depth
     E = len(edges.uv)

@@ -59,7 +59,7 @@ START = np.array([-1.2, 1.0])
 MANY = LmConfig(max_iterations=200, cost_tolerance=1e-14)
 
 
-def test_finds_the_bottom_of_a_bent_valley_and_never_climbs():
+def test_finds_the_minimum_of_a_curved_valley_with_decreasing_cost():
     curve = Curve()
     end, summary = minimise(curve, START, MANY)
     assert summary.stop.converged
@@ -78,7 +78,7 @@ def test_no_state_is_linearised_twice_and_the_best_is_returned():
     assert summary.accepted < 4
 
 
-def test_refused_steps_count_and_raise_the_damping():
+def test_rejected_steps_count_and_raise_the_damping():
     _, summary = minimise(Curve(), START, replace(MANY, max_iterations=3, mu=1e-9))
     assert summary.iterations == 3
     assert summary.accepted < 3  # the first full Gauss-Newton step overshoots
@@ -92,11 +92,11 @@ def test_stalls_when_no_step_helps():
     np.testing.assert_array_equal(end.x, START)
 
 
-def test_says_singular_when_no_damping_helps():
+def test_reports_singular_when_no_damping_helps():
     assert minimise(Curve(singular=True), START, MANY)[1].stop is StopReason.SINGULAR
 
 
-def test_candidates_that_are_not_finite_are_refused():
+def test_non_finite_candidates_are_rejected():
     end, summary = minimise(Curve(spoil=math.nan), START, MANY)
     assert summary.stop is StopReason.STALLED
     np.testing.assert_array_equal(end.x, START)
@@ -115,6 +115,6 @@ def test_starts_at_the_minimum():
 
 
 @pytest.mark.parametrize("wrong", [{"max_iterations": -1}, {"mu": 0.0}, {"delta": 0.0}])
-def test_config_refuses_nonsense(wrong):
+def test_config_rejects_invalid_values(wrong):
     with pytest.raises(ValueError, match="must"):
         LmConfig(**wrong)

@@ -61,7 +61,7 @@ def baselines(T_c_w: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("part", ["points", "edges", "everything"])
-def test_clean_window_comes_back_exactly(part):
+def test_a_noise_free_window_is_recovered_exactly(part):
     window = seeded_window(1, SMALL, CLEAN)
     problem = window.problem
     if part == "points":
@@ -157,7 +157,7 @@ def test_twenty_starts_end_in_one_minimum(rng):
 
 
 @pytest.mark.parametrize("kernel", [Kernel.HUBER, Kernel.CAUCHY, Kernel.TUKEY])
-def test_outliers_are_named_and_do_not_bend_the_poses(kernel, rng):
+def test_outliers_are_identified_and_do_not_affect_the_poses(kernel, rng):
     window = points_only(seeded_window(8, WindowSize(poses=6, fixed=2, anchors=200, observations=1000)))
     problem = window.problem
     bad = np.zeros(len(problem.uv), bool)
@@ -278,7 +278,7 @@ def test_depth_priors_set_the_scale(rng):
     assert len(result.chi2) == len(window.problem.uv)
 
 
-def test_pose_prior_holds_what_nothing_else_does():
+def test_pose_prior_constrains_an_unobserved_pose():
     window = points_only(seeded_window(15, replace(SMALL, fixed=0)))
     priors = tuple(PosePrior(i, window.T_c_w[i], 1e8 * np.eye(6)) for i in (0, 5))
     result = refine_window(replace(window.problem, pose_priors=priors), TIGHT)
@@ -418,7 +418,7 @@ def test_misuse_names_the_array(change, message):
         refine_window(replace(problem, **change))
 
 
-def test_the_same_window_gives_the_same_bytes():
+def test_results_are_reproducible_to_the_byte():
     problem = seeded_window(18, SMALL).problem
     a, b = refine_window(problem), refine_window(problem)
     assert a.T_c_w.tobytes() == b.T_c_w.tobytes()
@@ -426,7 +426,7 @@ def test_the_same_window_gives_the_same_bytes():
     assert a.edge_inverse_depth.tobytes() == b.edge_inverse_depth.tobytes()
 
 
-def test_input_arrays_are_left_alone():
+def test_input_arrays_are_unchanged():
     problem = seeded_window(19, SMALL).problem
     T, p = problem.T_c_w.copy(), problem.p_w.copy()
     refine_window(problem)

@@ -12,7 +12,7 @@ from edgeslam_torch.slam import EdgeSlam
 
 
 @pytest.mark.slow
-def test_modules_fly_the_compiled_solvers_trajectory(monkeypatch):
+def test_modules_reproduce_the_compiled_solvers_trajectory(monkeypatch):
     flown = film(stairs_world(), CAMERA, sideways(24, 0.04, turn_rad=0.006), step_s=1 / 15)
     # Every term takes part.
     terms = WindowConfig(

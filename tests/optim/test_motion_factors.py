@@ -102,7 +102,7 @@ def test_heading_jacobian_matches_finite_differences(rng):
             assert J[pose, k] == pytest.approx((up_ - down) / (2 * STEP), abs=1e-7)
 
 
-def test_a_heading_is_a_turn_about_the_vertical_and_nothing_else(rng):
+def test_a_heading_is_a_rotation_about_the_vertical_only(rng):
     T = random_poses(rng, 2)
     up = np.array([0.0, 0.0, 1.0])
     for axis, turn, sine in ((up, 0.3, np.sin(0.3)), (up, -0.3, -np.sin(0.3)), (np.array([1.0, 0.0, 0.0]), 0.3, 0.0)):
@@ -131,7 +131,7 @@ def test_gravity_has_a_direction():
         assert cost(MotionTerms((), (factor,), (), np.arange(1)), T) == pytest.approx(expected, abs=1e-9)
 
 
-def test_nothing_to_say_costs_nothing_and_changes_nothing(rng):
+def test_no_factors_have_no_cost_and_no_effect(rng):
     T = random_poses(rng, 2)
     H, g = np.zeros((12, 12)), np.zeros(12)
     assert MotionTerms((), (), (), np.arange(2)).linearise(T, H, g) == 0.0

@@ -48,7 +48,7 @@ def composed(S_0, steps):
     return np.stack(out)
 
 
-def test_true_edges_bring_back_a_drifted_ring():
+def test_true_edges_recover_a_drifted_ring():
     true = ring()
     i, j, S_ij, wrong = drifted(true, np.array([0.01, -0.02, 0.015, 0.004, -0.006, 0.003, 0.01]))
     start = composed(true[0], wrong)
@@ -58,7 +58,7 @@ def test_true_edges_bring_back_a_drifted_ring():
     np.testing.assert_allclose(solve(graph_of(start, i, j, S_ij)), true, atol=1e-6)
 
 
-def test_drift_of_scale_turn_and_place_is_shared_by_the_steps():
+def test_drift_of_scale_rotation_and_translation_is_distributed():
     true = ring()
     i, j, _, wrong = drifted(true, np.array([0.0, 0.0, 0.01, 0.0, 0.002, 0.0, 0.005]))
     start = composed(true[0], wrong)
@@ -80,7 +80,7 @@ def test_drift_of_scale_turn_and_place_is_shared_by_the_steps():
     assert np.abs(scales).max() < 0.5 * np.log(sim3.scale_of(start[-1]))
 
 
-def test_a_graph_without_contradiction_stays_as_it_is():
+def test_a_consistent_graph_is_unchanged():
     true = ring()
     graph = graph_of(true, *chain(true))
     np.testing.assert_allclose(solve(graph), true, atol=1e-12)
@@ -101,7 +101,7 @@ def test_a_weaker_edge_takes_more_of_the_correction():
     np.testing.assert_allclose(solved[:, 2, 3], [0.0, -0.8, -1.0], atol=1e-6)
 
 
-def test_the_gauge_is_held():
+def test_the_gauge_is_fixed():
     true = ring()
     i, j, _, wrong = drifted(true, np.array([0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.01]))
     graph = graph_of(true, i, j, wrong)

@@ -27,7 +27,7 @@ def error(T: np.ndarray, true: np.ndarray) -> float:
     return float(np.abs(se3.log(T @ se3.inverse(true))).max())
 
 
-def test_clean_view_comes_back_exactly(rng):
+def test_a_noise_free_pose_is_recovered_exactly(rng):
     T, p, uv = view(rng)
     result = refine_pose(away(T, rng), p, uv, np.ones(300), K)
     assert result.status is PoseStatus.OK
@@ -91,7 +91,7 @@ def test_points_behind_are_outliers_and_do_not_break_it(rng):
 
 
 @pytest.mark.parametrize("n", [0, 1, 5])
-def test_few_points_say_so(n, rng):
+def test_few_points_have_a_status(n, rng):
     T, p, uv = view(rng)
     result = refine_pose(T, p[:n], uv[:n], np.ones(n), K)
     assert result.status is PoseStatus.FEW_POINTS
@@ -99,7 +99,7 @@ def test_few_points_say_so(n, rng):
     assert result.inliers.shape == (n,)
 
 
-def test_points_that_do_not_fix_a_pose_say_so(rng):
+def test_degenerate_points_have_a_status(rng):
     T, p, _ = view(rng, 40)
     p = np.repeat(p[:1], 40, 0)  # one point forty times
     p_c = se3.transform(T, p)
@@ -109,7 +109,7 @@ def test_points_that_do_not_fix_a_pose_say_so(rng):
     np.testing.assert_array_equal(result.T_c_w, T)
 
 
-def test_input_that_is_not_finite_says_so(rng):
+def test_non_finite_input_has_a_status(rng):
     T, p, uv = view(rng)
     uv[3, 0] = np.nan
     assert refine_pose(T, p, uv, np.ones(300), K).status is PoseStatus.NOT_FINITE
@@ -129,13 +129,13 @@ def test_lengths_must_agree(rng):
         refine_pose(T, p[:-1], uv, np.ones(300), K)
 
 
-def test_one_iteration_says_that_it_did_not_converge(rng):
+def test_one_iteration_has_the_status_not_converged(rng):
     T, p, uv = view(rng, 300, 1.0)
     config = replace(PoseConfig(), iterations=1, rounds=1)
     assert refine_pose(away(T, rng, 0.05), p, uv, np.ones(300), K, config=config).status is PoseStatus.NOT_CONVERGED
 
 
-def test_slack_is_the_covariance_that_it_says(rng):
+def test_slack_has_the_stated_covariance(rng):
     """Against Gauss-Newton with every point's full 2x2 covariance, near the solution."""
     p = rng.uniform((-1, -1, 2), (1, 1, 4), (60, 3))
     slack = rng.normal(0.0, 8.0, (60, 2))

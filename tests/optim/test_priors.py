@@ -20,7 +20,7 @@ def relation(rng, T_i, T_j, off=0.3):
     return RelativePosePrior(0, 1, se3.exp(rng.normal(0.0, off, 6)) @ T_j @ se3.inverse(T_i), half @ half.T)
 
 
-def test_adjoint_carries_a_tangent_through_a_pose(rng):
+def test_adjoint_transforms_a_tangent(rng):
     T, d = pose(rng), rng.normal(0.0, 0.2, 6)
     np.testing.assert_allclose(se3.exp(se3.adjoint(T) @ d), T @ se3.exp(d) @ se3.inverse(T), atol=1e-12)
 

@@ -74,12 +74,12 @@ def test_edges_alone_find_the_pose(flight, tracker, rng, index):
     assert pose.edges > 300
 
 
-def test_switched_off_no_edges_are_looked_for(flight, tracker):
+def test_disabled_tracking_uses_no_edges(flight, tracker):
     off = EdgeTracker(tracker.map, tracker.edges, tracker.camera, enabled=False)
     assert off.refine(grey_of(flight, 1), se3.inverse(flight.T_w_c[1])) is None
 
 
-def test_from_farther_off_a_wrong_pose_is_not_believed(flight, tracker, rng):
+def test_a_wrong_pose_from_a_distant_prediction_is_rejected(flight, tracker, rng):
     """Up to 30 px: edges meet the wrong neighbours, in some starts; no such pose counts as fixed."""
     found = 0
     for index in (1, 2, 3) * 6:
@@ -101,7 +101,7 @@ def test_sigma_covers_the_error(flight, tracker, rng):
     assert np.median(chi2) < 12.6  # chi-square, six degrees of freedom, 95 %
 
 
-def test_parallel_lines_do_not_fix_a_pose():
+def test_parallel_lines_do_not_constrain_a_pose():
     tracker = tracker_on(STRIPES, np.full((240, 320), 2.0), np.eye(4))
     pose = tracker.refine(STRIPES, np.eye(4))
     assert pose.edges > 500

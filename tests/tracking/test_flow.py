@@ -68,7 +68,7 @@ def error(T_c_w, T_w_c):
 
 
 @pytest.mark.parametrize("frame", [0, 1, 3])
-def test_pose_to_half_a_pixel_from_a_prediction_that_is_ten_pixels_off(scene, frame):
+def test_pose_is_accurate_to_half_a_pixel_from_a_prediction_error_of_ten(scene, frame):
     """Panels 1.6 to 4 m away; at frame 3 they have moved by 10 to 30 pixels."""
     off = se3.exp(np.array([0.02, -0.02, 0.02, 0.008, -0.008, 0.008]))
     followed = scene.tracker().follow(scene.template, grey_at(POSES[frame]), off @ se3.inverse(POSES[frame]))
@@ -79,7 +79,7 @@ def test_pose_to_half_a_pixel_from_a_prediction_that_is_ten_pixels_off(scene, fr
     assert (np.sqrt(np.diag(followed.track.covariance)) < 0.02).all()
 
 
-def test_flow_is_truer_than_half_a_pixel(scene):
+def test_flow_is_accurate_to_half_a_pixel(scene):
     """Rendered truth of every point against where flow puts it; corners at panel borders hide things, hence 80 %."""
     tracker = scene.tracker()
     keypoint = scene.keyframe.keypoints_with_anchor()
@@ -90,7 +90,7 @@ def test_flow_is_truer_than_half_a_pixel(scene):
     assert found.mean() > 0.8
 
 
-def test_no_more_keypoints_are_followed_than_asked_for_and_the_rest_are_spread(scene):
+def test_the_number_of_tracked_keypoints_is_limited_and_they_are_spread(scene):
     tracker = scene.tracker(points=60)
     track = tracker.follow(scene.template, scene.grey, scene.keyframe.T_c_w).track
     assert track.matches <= 60
@@ -98,7 +98,7 @@ def test_no_more_keypoints_are_followed_than_asked_for_and_the_rest_are_spread(s
     assert len({(int(u // 80), int(v // 80)) for u, v in uv}) >= 11  # cells of a 4 x 3 grid
 
 
-def test_anchors_that_went_out_of_the_map_are_not_followed(scene):
+def test_removed_anchors_are_not_tracked(scene):
     gone = scene.keyframe.anchor[::2].copy()
     scene.map.remove_anchors(gone)
     track = scene.tracker(points=1000).follow(scene.template, scene.grey, scene.keyframe.T_c_w).track
@@ -118,7 +118,7 @@ def test_keypoints_out_of_view_count_against_the_share(scene):
     assert lost_most(replace(followed, share=0.6), MappingConfig())
 
 
-def test_a_pose_rests_on_the_keypoints_that_are_in_view(scene):
+def test_a_pose_uses_the_keypoints_in_view(scene):
     """A third of the template is left, and nearly all of that is found: no reason to be lost."""
     turned = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, 0.75, 0]))
     followed = scene.tracker().follow(scene.template, grey_at(turned), se3.inverse(turned))
@@ -127,7 +127,7 @@ def test_a_pose_rests_on_the_keypoints_that_are_in_view(scene):
     assert error(followed.track.T_c_w, turned)[0] < 0.02
 
 
-def test_few_of_what_is_in_view_tell_where_to_look_and_no_pose(scene):
+def test_few_inliers_in_view_give_a_prediction_but_no_pose(scene):
     """Most of the image is blurred: what is left agrees, and is no evidence about the other anchors."""
     grey = scene.grey.copy()
     left = grey.shape[1] // 4
@@ -140,7 +140,7 @@ def test_few_of_what_is_in_view_tell_where_to_look_and_no_pose(scene):
     np.testing.assert_array_equal(scene.map.anchors.visible, before)
 
 
-def test_all_levels_are_taken_only_where_they_find_more(scene, monkeypatch):
+def test_all_pyramid_levels_are_used_only_if_they_find_more(scene, monkeypatch):
     """Coarse levels lose keypoints near the border of the image."""
     tracker, tried = scene.tracker(), []
     found = FlowTracker._locate
@@ -216,7 +216,7 @@ def test_a_matched_frame_can_be_followed_without_being_a_keyframe(scene):
     assert error(followed.track.T_c_w, POSES[1])[0] < 0.01
 
 
-def test_what_flow_finds_and_matching_does_not_goes_to_the_keypoint_that_shows_it(scene):
+def test_anchors_found_by_flow_only_are_assigned_to_free_keypoints(scene):
     """Of a frame's keypoints every second is matched; flow gives the others to the corners under it."""
     grey = grey_at(POSES[1])
     view = make_view(OrbExtractor(ORB, CAMERA)(grey), ORB.scale_factor)
@@ -278,7 +278,7 @@ def test_keyframe_by_view_change_parallax_or_time_but_not_at_once():
     assert not is_due(False, little, 33.0, config)  # a drone that hovers makes no keyframes
 
 
-def test_few_matches_are_judged_by_anchors_that_have_proved_themselves(scene):
+def test_few_matches_is_decided_by_stable_anchors(scene):
     """With three keyframes, none of 500 anchors seen by a single keyframe counts."""
     ids = scene.keyframe.anchor
     track = Track(scene.keyframe.T_c_w, np.arange(30), ids[:30], np.arange(30), ids[:30], np.eye(6))
@@ -290,12 +290,12 @@ def test_few_matches_are_judged_by_anchors_that_have_proved_themselves(scene):
 
 
 @pytest.mark.parametrize("settings", [{"points": 0}, {"window_px": 3}, {"levels": 0}, {"min_share": 0.0}])
-def test_settings_out_of_range_are_refused(settings):
+def test_settings_out_of_range_are_rejected(settings):
     with pytest.raises(ValueError, match=next(iter(settings))):
         FlowConfig(**settings)
 
 
-def test_keypoints_are_chosen_anew_when_the_map_changes(scene):
+def test_keypoints_are_selected_again_when_the_map_changes(scene):
     tracker, at = scene.tracker(points=1000), se3.inverse(POSES[0])
     before = tracker.follow(scene.template, scene.grey, at).track.anchor
     scene.map.remove_anchors(before[:50])
@@ -308,7 +308,7 @@ def test_keypoints_are_chosen_anew_when_the_map_changes(scene):
     assert np.isin(ids, tracker.follow(scene.template, scene.grey, at).track.matched_anchor).sum() > 40
 
 
-def test_what_does_not_look_alike_was_not_found(scene, rng):
+def test_dissimilar_patches_are_rejected(scene, rng):
     """The left half of the frame is noise: flow ends somewhere there too, but nothing of it counts as found."""
     image = scene.grey.copy()
     image[:, :160] = rng.integers(0, 256, (240, 160), dtype=np.uint8)
@@ -331,7 +331,7 @@ def test_flow_weighs_keypoints_by_their_level(scene):
 
 
 @pytest.mark.parametrize(("off_px", "shows_it"), [(1.0, True), (3.0, False)])
-def test_a_free_keypoint_shows_an_anchor_where_flow_puts_it_and_not_beside(scene, off_px, shows_it):
+def test_a_free_keypoint_is_assigned_only_near_the_flow_result(scene, off_px, shows_it):
     """At level 0 the tolerance is 1.5 px."""
     all_found = scene.tracker().follow(scene.template, scene.grey, scene.keyframe.T_c_w)
     one, none = np.array([5]), np.zeros(0, np.int64)

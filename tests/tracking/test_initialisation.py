@@ -67,7 +67,7 @@ def test_two_exact_views_give_the_exact_world(points):
     assert np.abs(xi).max() < 1e-3
 
 
-def test_scale_comes_from_the_guess(points):
+def test_scale_comes_from_predicted_depths(points):
     """Twice the guessed depth: twice the baseline, about the first camera."""
     one, two = (two_views(points, k * z_in(points, 0)) for k in (1.0, 2.0))
     centre = points.keyframes[0].centre_w
@@ -75,7 +75,7 @@ def test_scale_comes_from_the_guess(points):
     assert one.parallax_rad == two.parallax_rad
 
 
-def test_rotation_alone_is_refused_with_its_name(points):
+def test_pure_rotation_is_rejected_with_a_reason(points):
     turn = se3.exp(np.array([0, 0, 0, 0.02, 0.1, 0.0]))
     ahead = np.flatnonzero(z_in(points, 0) > 1.0)
     p_c = se3.transform(turn @ points.world.T_c_w[0], points.world.p_w[points.point_of[0][ahead]])
@@ -88,7 +88,7 @@ def test_rotation_alone_is_refused_with_its_name(points):
     assert found.reason == "pure rotation"
 
 
-def test_few_matches_are_refused_with_their_name(points):
+def test_few_matches_are_rejected_with_a_reason(points):
     a, b = matches(points, 0, 4)
     view = view_of(points, 4)
     assert (
@@ -99,7 +99,7 @@ def test_few_matches_are_refused_with_their_name(points):
     assert "points triangulate" in few.reason
 
 
-def test_witnesses_agree_with_a_right_map_and_get_their_poses(points):
+def test_intermediate_frames_confirm_a_correct_map_and_get_poses(points):
     p = point_of_keypoint(points, two_views(points, z_in(points, 0)))
     rough = [small_motion(np.random.default_rng(v), 0.05, 0.02) @ points.world.T_c_w[v] for v in (1, 2, 3)]
     views = [witness(points, v, T) for v, T in zip((1, 2, 3), rough, strict=True)]
@@ -110,7 +110,7 @@ def test_witnesses_agree_with_a_right_map_and_get_their_poses(points):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_witnesses_refuse_a_wrong_map(points, seed):
+def test_intermediate_frames_reject_a_wrong_map(points, seed):
     """Points slid along the first camera's rays: that view still agrees with every one of them, others do not."""
     rng = np.random.default_rng(seed)
     p = point_of_keypoint(points, two_views(points, z_in(points, 0)))
@@ -120,7 +120,7 @@ def test_witnesses_refuse_a_wrong_map(points, seed):
     assert share < WITNESS_SHARE
 
 
-def test_witness_that_sees_nothing_of_it_keeps_its_pose_and_says_nothing(points):
+def test_an_intermediate_frame_without_matches_keeps_its_pose_and_is_ignored(points):
     nothing = np.full((len(points.point_of[0]), 3), np.nan)
     poses, share = poses_of_witnesses([witness(points, 1)], nothing, CAMERA)
     np.testing.assert_array_equal(poses[0], points.world.T_c_w[1])
@@ -159,7 +159,7 @@ def attempted(points, **config):
 
 
 @pytest.mark.parametrize("side", ["reference", "frame"])
-def test_keypoints_that_slid_along_edges_do_not_tell_the_motion(points, side):
+def test_keypoints_on_edges_are_not_used_for_motion(points, side):
     """Every keypoint slides with its neighbours, as on the parallel joints of a wall, but for 40 % of them."""
     corner = np.random.default_rng(0).random(len(points.point_of[0])) < 0.4
     view = view_of(points, 4)
@@ -213,7 +213,7 @@ def test_without_a_network_two_views_need_a_smaller_sigma(points, network):
     assert network or accepted.reason == "rotation and translation are not yet distinguishable"
 
 
-def test_frames_that_waited_become_keyframes_in_order(points):
+def test_intermediate_frames_become_keyframes_in_order(points):
     result = started(points, keyframe_gap_s=0.01)
     new = [k for _, k in result.new]
     assert [k.frame_index for k in new] == [points.keyframes[v].frame_index for v in (1, 2, 3, 4)]
@@ -226,7 +226,7 @@ def test_frames_that_waited_become_keyframes_in_order(points):
     assert (observed >= 4).mean() > 0.8
 
 
-def test_of_many_waiting_frames_those_that_stand_apart_stay(points):
+def test_distant_intermediate_frames_are_kept(points):
     guess = z_in(points, 0)
     bootstrap = make_bootstrap(points, guess, InitialisationConfig(keyframe_gap_s=0.01, max_keyframes=2))
     for index, view in enumerate((1, 1, 1, 2, 3), start=1):
@@ -240,7 +240,7 @@ def test_of_many_waiting_frames_those_that_stand_apart_stay(points):
     assert bootstrap.waiting[-1].frame.index == 5
 
 
-def test_the_same_picture_again_is_no_measure_of_later_ones(points):
+def test_a_repeated_image_does_not_set_the_maximum_of_matches(points):
     """A camera that stands still matches every keypoint; by that, the first step away would look like another view."""
     bootstrap = make_bootstrap(points, z_in(points, 0))
     still = bootstrap.track(view_of(points, 0), points.world.T_c_w[0])
@@ -250,7 +250,7 @@ def test_the_same_picture_again_is_no_measure_of_later_ones(points):
     assert bootstrap.max_matched == moved.inliers > 0
 
 
-def test_abandoned_attempt_leaves_no_guess_behind(points):
+def test_an_abandoned_initialisation_removes_its_anchors(points):
     bootstrap = make_bootstrap(points, np.ones(len(points.point_of[0])))
     bootstrap.forget_guess()
     check_map(points.map)
@@ -296,7 +296,7 @@ def with_network(points):
     points.keyframes[0].depth = DepthMap(flat, 0.2 * flat)
 
 
-def test_a_map_that_the_frames_between_refute_is_refused(points):
+def test_a_map_rejected_by_intermediate_frames_is_not_used(points):
     bootstrap, found = offered(points)
     assert bootstrap.confirm(view_of(points, 4), found).ok
     refused = bootstrap.confirm(view_of(points, 4), slid(points, found))
@@ -332,7 +332,7 @@ def seen_by(points, views):
 @pytest.mark.parametrize(
     ("turned_deg", "taken"), [(0.0, True), (4.0, True), (10.0, False), (-40.0, False), (None, False)]
 )
-def test_what_depends_on_random_samples_waits_for_a_frame_between(points, monkeypatch, turned_deg, taken):
+def test_a_structure_that_depends_on_random_samples_waits_for_confirmation(points, monkeypatch, turned_deg, taken):
     """Two directions that are sure to 4.6 degrees each are within 6.5 of each other."""
     samples_that_say_otherwise(monkeypatch, turned_deg)
     found = seen_by(points, (4,))
@@ -341,14 +341,14 @@ def test_what_depends_on_random_samples_waits_for_a_frame_between(points, monkey
     assert seen_by(points, (2, 4)).ok
 
 
-def test_a_map_that_too_many_observations_refute_is_refused(points):
+def test_a_map_with_many_outliers_is_rejected(points):
     """38 % of the matches between are wrong: 62 % of each witness agree, and 77 % of all observations."""
     bootstrap, found = offered(points, wrong_between=0.38)
     refused = bootstrap.confirm(view_of(points, 4), found)
     assert (refused.ok, refused.reason) == (False, "the frames together disagree with two views")
 
 
-def test_of_two_structures_the_one_that_fits_becomes_the_map(points):
+def test_of_two_structures_the_lower_cost_wins(points):
     """Without views between: a structure that fits nothing, and one initialised from the network's depth."""
     with_network(points)
     bootstrap, found = offered(points, between=())
@@ -377,14 +377,14 @@ def test_structure_from_the_networks_depth_keeps_its_scale(points):
     )
 
 
-def test_a_turn_that_may_be_a_shift_is_refused(points):
+def test_an_ambiguous_rotation_is_rejected(points):
     bootstrap, found = offered(points, max_direction_sigma_alone=1e-9)
     refused = bootstrap.confirm(view_of(points, 4), found)
     assert (refused.ok, refused.reason) == (False, "rotation and translation are not yet distinguishable")
 
 
 @pytest.mark.parametrize("seed", [1, 3])
-def test_a_plane_seen_by_two_views_is_mapped_as_the_network_sees_it(seed):
+def test_the_network_resolves_the_ambiguity_of_a_plane(seed):
     """A plane's two views have two explanations that fit alike; only the shape of the guess tells them apart."""
     points = on_a_plane(PointMap(np.random.default_rng(seed), 400, 6))
     with_network(points)
@@ -449,7 +449,7 @@ def other_explanation(points, found):
     return best
 
 
-def test_a_guessed_map_that_is_adopted_keeps_what_was_matched(points):
+def test_an_adopted_predicted_map_keeps_its_matches(points):
     """Turned away before parallax came: the frames so far hang on the guess, each with its own matches."""
     with_network(points)
     bootstrap = make_bootstrap(points, z_in(points, 0), InitialisationConfig(keyframe_gap_s=0.01))
@@ -492,7 +492,7 @@ def test_points_behind_the_second_camera_do_not_triangulate(rng):
     assert found.keypoint.max() < len(ahead)
 
 
-def test_of_two_waiting_frames_in_one_place_one_goes_and_the_first_stays(points):
+def test_of_two_intermediate_frames_at_one_place_the_first_is_kept(points):
     """One step, another, and no step: the frame between two of one place is the one that tells least."""
     bootstrap = make_bootstrap(points, z_in(points, 0), InitialisationConfig(keyframe_gap_s=0.01, max_keyframes=2))
     for index, view in enumerate((1, 2, 2), start=1):

@@ -37,17 +37,17 @@ def share(points, track, uv, stamp_s=LATER_S):
     return known_share(track, uv, stamp_s, points.map, CAMERA, MappingConfig())
 
 
-def test_a_view_that_was_seen_before_is_known(visited):
+def test_a_view_of_an_earlier_visit_is_covered(visited):
     assert share(visited, *again(visited)) > 0.95
 
 
-def test_what_was_seen_just_now_is_no_earlier_visit(visited):
+def test_a_recent_view_is_no_earlier_visit(visited):
     """Six keyframes a second apart: the oldest is five seconds old."""
     assert share(visited, *again(visited), stamp_s=OLD_S - 1e-3) == 0.0
     assert share(visited, *again(visited), stamp_s=OLD_S + 5.0) > 0.95
 
 
-def test_the_map_of_an_earlier_flight_is_an_earlier_visit():
+def test_a_loaded_map_is_an_earlier_visit():
     points = PointMap(np.random.default_rng(3), 1500, 6)
     points.fill()
     for keyframe in points.keyframes:
@@ -55,7 +55,7 @@ def test_the_map_of_an_earlier_flight_is_an_earlier_visit():
     assert share(points, *again(points), stamp_s=0.0) > 0.95
 
 
-def test_a_half_that_nothing_was_found_in_is_not_known(visited):
+def test_a_half_without_matches_is_not_covered(visited):
     track, uv = again(visited)
     left = uv[track.keypoint, 0] < 0.5 * CAMERA.width
     half = replace(track, keypoint=track.keypoint[left], anchor=track.anchor[left])
@@ -71,19 +71,19 @@ def from_elsewhere(points, shift):
 
 
 @pytest.mark.parametrize("shift", [(0.0, -0.3, 0.0), (0.0, 0.0, -0.6)])
-def test_another_side_and_another_distance_are_not_known(visited, shift):
+def test_another_direction_or_distance_is_not_covered(visited, shift):
     """Fifteen degrees of parallax; 1.6 times as far, which is two pyramid levels."""
     assert share(visited, *again(visited, T_c_w=from_elsewhere(visited, shift)), stamp_s=SOON_S) < 0.3
 
 
-def test_after_long_another_side_that_looks_alike_is_known(visited):
+def test_a_completed_visit_covers_similar_directions(visited):
     """Some six degrees of parallax; a tenth of the depth farther, two pyramid levels for the nearest."""
     for shift in [(0.0, -0.1, 0.0), (0.0, 0.0, -0.1)]:
         frame = again(visited, T_c_w=from_elsewhere(visited, shift))
         assert share(visited, *frame) > 0.8 > share(visited, *frame, stamp_s=SOON_S)
 
 
-def test_after_long_another_side_that_looks_unlike_is_not_known(visited):
+def test_a_completed_visit_does_not_cover_other_directions(visited):
     """Thirty degrees of parallax; 2.5 times as far, which is five pyramid levels."""
     for shift in [(0.0, -0.8, 0.0), (0.0, 0.0, -1.5)]:
         assert share(visited, *again(visited, T_c_w=from_elsewhere(visited, shift))) < 0.4
@@ -96,25 +96,25 @@ def thinned(points, among, every):
     return replace(track, keypoint=track.keypoint[kept], anchor=track.anchor[kept]), uv
 
 
-def test_after_long_what_is_expected_needs_not_be_found(visited):
+def test_a_completed_visit_covers_expected_anchors_without_matches(visited):
     """A third is found again in the same place, spread over the view."""
     track, uv = thinned(visited, lambda uv: uv[:, 0] >= 0, 3)
     assert share(visited, track, uv) > 0.9
 
 
-def test_a_part_in_which_nothing_is_found_any_more_has_changed(visited):
+def test_a_part_without_any_matches_has_changed(visited):
     track, uv = thinned(visited, lambda uv: uv[:, 0] < 0.5 * CAMERA.width, 1)
     assert share(visited, track, uv) < KNOWN_SHARE
 
 
-def test_depths_that_are_only_guessed_are_not_known():
+def test_predicted_depths_are_not_covered():
     points = PointMap(np.random.default_rng(3), 1500, 6)
     points.fill()
     points.map.anchors.from_depth[:] = True
     assert share(points, *again(points)) == 0.0
 
 
-def test_a_half_whose_depths_are_only_guessed_is_not_known():
+def test_a_half_with_predicted_depths_is_not_covered():
     points = PointMap(np.random.default_rng(3), 1500, 6)
     points.fill()
     track, uv = again(points)

@@ -22,12 +22,12 @@ def moving() -> MotionModel:
     return model
 
 
-def test_goes_on_as_it_moved():
+def test_prediction_has_constant_velocity():
     assert np.allclose(se3.inverse(moving().predict(12.5))[:3, 3], [3.5, 0, 0])
     assert not moving().velocity_unknown
 
 
-def test_a_prediction_taken_for_a_pose_fades_and_a_stop_stands():
+def test_velocity_decays_without_measurements_and_is_reset_by_a_stop():
     model = moving()
     model.drift(model.predict(11.5))
     model.stamp_s = 11.5
@@ -47,7 +47,7 @@ def test_a_correction_of_the_keyframe_moves_the_pose_in_the_keyframes_frame():
     assert np.allclose(model.T_c_w, at(2.0) @ turn)
 
 
-def test_expectation_grows_with_the_square_of_time_and_is_in_map_units():
+def test_sigma_of_a_prediction_grows_with_the_square_of_time_in_map_units():
     model = moving()
     near, far = (model.pose_prior(10.5 + dt, at(1.5), 2.0).information for dt in (0.1, 0.2))
     assert np.allclose(np.sqrt(np.diag(near) / np.diag(far)), 4.0)
@@ -70,7 +70,7 @@ def test_predictions_that_become_poses_stay_rigid_motions():
     np.testing.assert_allclose(T, steady, atol=1e-6)
 
 
-def test_before_any_velocity_is_known_it_may_have_moved_all_the_time():
+def test_unknown_velocity_increases_the_sigma():
     """Half a metre and one radian a second over a tenth, beside what accelerations add."""
     model = MotionModel(at(1.0))
     model.stamp_s = 10.0

@@ -51,24 +51,24 @@ def tilt_deg(T_c_w):
     return math.degrees(math.acos(min(1.0, T_c_w[:3, 2] @ LEVEL[:3, 2])))
 
 
-def test_a_climb_before_guessed_depths_is_a_climb_by_the_drones_attitude(wall):
+def test_attitude_resolves_a_climb_on_predicted_depths(wall):
     upright = solved(wall, Vertical(LEVEL[:3, 2], 0.0)).T_c_w
     assert tilt_deg(upright) < 0.02
     assert se3.inverse(upright)[2, 3] == pytest.approx(CLIMB_M, rel=0.2)
 
 
-def test_a_pose_that_is_held_is_no_surer_than_its_image(wall):
+def test_a_constrained_pose_keeps_the_covariance_of_its_image(wall):
     constrained, free = solved(wall, Vertical(LEVEL[:3, 2], 0.0)), solved(wall, None)
     assert not np.allclose(constrained.T_c_w, free.T_c_w)
     np.testing.assert_array_equal(constrained.covariance, free.covariance)
 
 
-def test_a_vertical_that_the_image_contradicts_does_not_count(wall):
+def test_a_vertical_contradicted_by_images_is_ignored(wall):
     wrong = Vertical(tilted(25.0)[:3, 2], 0.0)
     np.testing.assert_allclose(solved(wall, wrong).T_c_w, solved(wall, None).T_c_w)
 
 
-def test_a_vertical_that_turned_fast_says_little(wall):
+def test_a_fast_rotation_weakens_the_vertical(wall):
     off = tilted(0.7)[:3, 2]
     constrained, doubtful = (solved(wall, Vertical(off, doubt)).T_c_w for doubt in (0.0, math.radians(20.0)))
     free = solved(wall, None).T_c_w
@@ -85,14 +85,14 @@ def test_levelling_keeps_the_centre_and_the_heading():
     assert across @ prior.information[3:, 3:] @ across > 1e8
 
 
-def test_attitude_denies_a_turn_that_whole_degrees_do_not_explain():
+def test_attitude_gate_rejects_rotations_beyond_quantisation():
     told = Attitude(LEVEL[:3, :3], math.radians(1.0))
     assert not told.is_outlier(LEVEL) and not told.is_outlier(climbed())
     assert not told.is_outlier(tilted(3.9)) and not told.is_outlier(tilted(-3.9))
     assert told.is_outlier(tilted(4.1)) and told.is_outlier(tilted(-4.1))
 
 
-def test_attitude_turns_a_pose_about_its_centre():
+def test_attitude_rotates_a_pose_about_its_centre():
     turned = Attitude(LEVEL[:3, :3], 0.0).applied_to(tilted(20.0, climbed()))
     np.testing.assert_allclose(turned, climbed(), atol=1e-12)
 
@@ -133,7 +133,7 @@ def centre_of(found):
     return se3.inverse(found.T_c_w)[:3, 3]
 
 
-def test_a_climb_before_a_wall_that_leans_in_the_map_is_one_that_the_drone_has_made(papered):
+def test_position_resolves_a_climb_before_a_tilted_wall(papered):
     true = np.array([0.0, 0.0, CLIMB_M])
     free = centre_of(before_the_wall(papered, None))
     assert abs(free[2] - CLIMB_M) > 0.1
@@ -142,7 +142,7 @@ def test_a_climb_before_a_wall_that_leans_in_the_map_is_one_that_the_drone_has_m
     np.testing.assert_array_equal(centre_of(before_the_wall(papered, at(free))), free)
 
 
-def test_a_pose_that_is_held_at_a_place_is_as_unsure_as_that(papered):
+def test_a_pose_constrained_by_position_has_its_uncertainty(papered):
     """The images say something else: along the axes that are held its sigma is the doubt, and no other changes."""
     free = before_the_wall(papered, None)
     place = at(np.array([0.0, 0.0, CLIMB_M]))
@@ -155,7 +155,7 @@ def test_a_pose_that_is_held_at_a_place_is_as_unsure_as_that(papered):
     np.testing.assert_array_equal(constrained.covariance[3:], free.covariance[3:])
 
 
-def test_what_cannot_be_solved_is_not_held(papered):
+def test_a_failed_solution_is_not_constrained(papered):
     anchors, ids, uv = papered
     expected = TrackingPrior(PosePrior(0, LEVEL, np.eye(6)), None, at(np.array([0.0, 0.0, CLIMB_M])))
     few = slice(0, 4)
@@ -164,7 +164,7 @@ def test_what_cannot_be_solved_is_not_held(papered):
     np.testing.assert_array_equal(found.T_c_w, LEVEL)
 
 
-def test_a_place_that_the_images_contradict_does_not_count(rng):
+def test_a_position_contradicted_by_images_is_ignored(rng):
     p_w = rng.uniform([1.5, -2.0, -1.0], [6.0, 2.0, 1.0], (300, 3))
     anchors, ids, uv = seen_from(climbed(), p_w, p_w, rng)
     lie = TrackingPrior(PosePrior(0, LEVEL, np.eye(6)), None, at(np.array([0.0, 0.0, -0.4])))
@@ -172,7 +172,7 @@ def test_a_place_that_the_images_contradict_does_not_count(rng):
     np.testing.assert_allclose(se3.inverse(found.T_c_w)[:3, 3], [0.0, 0.0, CLIMB_M], atol=0.02)
 
 
-def test_what_is_beyond_a_place_is_measured_along_its_axes():
+def test_distance_from_the_interval_is_measured_along_its_axes():
     place = Place(AXES, np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3]))
     inside, beyond = (AXES.T @ np.array(c) for c in ([1.09, 1.81, 3.0], [1.5, 1.5, 3.31]))
     T = np.eye(4)
@@ -188,7 +188,7 @@ def test_what_is_beyond_a_place_is_measured_along_its_axes():
     np.testing.assert_allclose(prior.T_c_w[:3, :3], T[:3, :3], atol=1e-12)
 
 
-def test_a_place_holds_only_the_axes_along_which_a_pose_has_left_it():
+def test_only_axes_outside_the_interval_are_constrained():
     place = Place(AXES, np.zeros(3), np.full(3, 0.1))
     T = np.block([[np.eye(3), -(AXES.T @ [0.0, 0.0, 0.5])[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
     information = place.constrained(T, PosePrior(0, np.eye(4), np.zeros((6, 6)))).information

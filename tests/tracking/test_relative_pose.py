@@ -67,13 +67,13 @@ def test_points_of_the_room_lie_in_front_of_both(rng):
 
 
 @pytest.mark.parametrize("noise_px", [0.0, 0.3])
-def test_pure_rotation_is_named(rng, noise_px):
+def test_pure_rotation_is_classified(rng, noise_px):
     turn = se3.exp(np.array([0, 0, 0, 0.03, 0.12, 0.02]))
     uv_i, uv_j, _ = seen_by_both(rng, turn, cloud(rng), noise_px)
     assert relative_pose(uv_i, uv_j, CAMERA).kind is MotionKind.PURE_ROTATION
 
 
-def test_a_turn_is_named_whatever_the_essential_matrix_makes_of_noise(rng):
+def test_rotation_is_classified_despite_a_noisy_essential_matrix(rng):
     """In one draw of four it finds a motion with parallax; a rotation alone explains the matches all the same."""
     made_up = 0
     for _ in range(30):
@@ -85,7 +85,7 @@ def test_a_turn_is_named_whatever_the_essential_matrix_makes_of_noise(rng):
     assert made_up > 0, "the draws hold the case that this is about"
 
 
-def test_plane_is_named(rng):
+def test_plane_is_classified(rng):
     p = cloud(rng)
     p *= (3.0 / (p @ [0.2, 0.1, 1.0]))[:, None]
     uv_i, uv_j, _ = seen_by_both(rng, MOTION, p, 0.2)
@@ -93,7 +93,7 @@ def test_plane_is_named(rng):
 
 
 @pytest.mark.parametrize("noise_px", [0.0, 0.3])
-def test_standing_still_is_named(rng, noise_px):
+def test_no_motion_is_classified(rng, noise_px):
     uv_i, uv_j, _ = seen_by_both(rng, np.eye(4), cloud(rng), noise_px)
     motion = relative_pose(uv_i, uv_j, CAMERA)
     assert motion.kind is MotionKind.NO_MOTION
@@ -101,7 +101,7 @@ def test_standing_still_is_named(rng, noise_px):
 
 
 @pytest.mark.parametrize("n", [0, 1, 14])
-def test_few_matches_are_named(rng, n):
+def test_few_matches_are_classified(rng, n):
     uv_i, uv_j, _ = seen_by_both(rng, MOTION, cloud(rng, n))
     motion = relative_pose(uv_i, uv_j, CAMERA)
     assert motion.kind is MotionKind.FEW_MATCHES
@@ -109,7 +109,7 @@ def test_few_matches_are_named(rng, n):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_nonsense_is_no_motion_of_any_kind_and_no_crash(seed):
+def test_invalid_matches_give_no_motion_and_no_crash(seed):
     """Matches at random, all at one place, or on a line."""
     rng = np.random.default_rng(seed)
     anywhere = rng.uniform([0, 0], [640, 480], (2, 60, 2))

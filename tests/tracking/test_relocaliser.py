@@ -58,7 +58,7 @@ def pose_error(T_c_w, truth):
     return np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])
 
 
-def test_a_picture_that_hangs_elsewhere_too_is_no_place(points, rng):
+def test_a_duplicate_poster_is_rejected(points, rng):
     """As in the simulated room that was 60 cm wrong: 51 inliers in one corner, of a thousand to be seen."""
     tracker = tracker_of(points)
     relocaliser = Relocaliser(tracker)
@@ -70,7 +70,7 @@ def test_a_picture_that_hangs_elsewhere_too_is_no_place(points, rng):
     assert relocaliser.waiting == 0
 
 
-def test_a_picture_alone_in_the_dark_is_no_place(points, rng):
+def test_a_single_poster_is_rejected(points, rng):
     """All that the frame sees is found, in one corner: whatever share of it agrees, it may hang anywhere."""
     relocaliser = Relocaliser(tracker_of(points))
     whole = view_of(points, 3, rng).features
@@ -85,7 +85,7 @@ def test_a_picture_alone_in_the_dark_is_no_place(points, rng):
         assert relocaliser.find(index, view, points.keyframes, SOMEWHERE) is None
 
 
-def test_a_pattern_that_fits_here_and_there_is_no_place(points, rng):
+def test_a_repeated_pattern_is_rejected(points, rng):
     """One keypoint of twelve agrees, all over the image: doors that repeat do as well in the wrong place."""
     tracker = tracker_of(points)
     relocaliser = Relocaliser(tracker)
@@ -98,7 +98,7 @@ def test_a_pattern_that_fits_here_and_there_is_no_place(points, rng):
 
 
 @pytest.mark.parametrize("view", [0, 3, 5])
-def test_lost_frame_is_found_at_once_where_motion_allows_it(points, rng, view):
+def test_a_lost_frame_within_reach_is_accepted_at_once(points, rng, view):
     seen = view_of(points, view, rng)
     found = Relocaliser(tracker_of(points)).find(7, seen, [points.keyframes[view]], SOMEWHERE)
     assert pose_error(found.track.T_c_w, points.world.T_c_w[view])[0] < 0.03
@@ -106,7 +106,7 @@ def test_lost_frame_is_found_at_once_where_motion_allows_it(points, rng, view):
 
 
 @pytest.mark.parametrize("one_of", [6, 11])
-def test_while_only_one_place_is_in_reach_what_agrees_with_it_is_it(points, rng, one_of):
+def test_the_only_reachable_place_is_accepted(points, rng, one_of):
     """Every sixth or eleventh keypoint is known, as in a blurred image: enough at once where the camera can hardly have
     moved, not after seconds, and not elsewhere."""
     tracker, view = tracker_of(points), view_of(points, 3, rng, lambda uv: (uv // 10).sum(axis=1) % one_of == 0)
@@ -117,7 +117,7 @@ def test_while_only_one_place_is_in_reach_what_agrees_with_it_is_it(points, rng,
         assert (found is not None) is at_once
 
 
-def test_beyond_reach_the_next_frames_must_agree(points, rng):
+def test_a_place_beyond_reach_needs_confirmation_by_frames(points, rng):
     relocaliser = Relocaliser(tracker_of(points))
     seen = view_of(points, 3, rng)
     for index in range(AGREEING_FRAMES - 1):
@@ -130,7 +130,7 @@ def test_beyond_reach_the_next_frames_must_agree(points, rng):
     assert relocaliser.waiting == 0
 
 
-def test_a_frame_that_disagrees_refutes_the_place(points, rng):
+def test_an_inconsistent_frame_rejects_the_place(points, rng):
     relocaliser = Relocaliser(tracker_of(points))
     seen = view_of(points, 3, rng)
     assert relocaliser.find(0, seen, points.keyframes, NOWHERE) is None
@@ -159,7 +159,7 @@ def doubled(rng, shift):
     return points
 
 
-def test_of_two_places_alike_none_is_believed_but_the_one_within_reach(rng):
+def test_of_two_similar_places_only_the_reachable_one_is_accepted(rng):
     points = doubled(rng, np.array([30.0, 0, 0]))
     relocaliser = Relocaliser(tracker_of(points))
     seen = view_of(points, 1, rng)
@@ -192,7 +192,7 @@ def test_reach_grows_with_the_square_of_time():
     assert (reach.metre * reach.shift_m) == pytest.approx(0.36)
 
 
-def test_nothing_else_can_be_meant_within_a_small_reach_or_where_it_is_expected():
+def test_aliasing_is_excluded_within_a_small_reach_or_at_the_expected_pose():
     """36 cm are all one place at a depth of 2.5 m; at 2 m as expected within 15 %; and at 1 m doors may repeat."""
     reach, aside = reach_after(0.2, np.eye(4), metre=2.0), se3.exp(np.array([0.35, 0, 0, 0, 0, 0]))
     assert reach.leaves_only(at(se3.exp(np.array([0.7, 0, 0, 0, 0, 0])), depth=2.5))
@@ -217,13 +217,13 @@ def at(T_c_w, depth):
     [([0.65, 0, 0, 0, 0, 0], True), ([0, -0.67, 0, 0, 0, 0], False), ([0, 0, 0, 0, 0.54, 0], True)]
     + [([0, 0, 0, 0, 0, -0.56], False)],
 )
-def test_within_reach_is_as_good_as_there(xi, inside):
+def test_reach_has_a_tolerance(xi, inside):
     """36 cm and 15 % of a depth of 2 m, and 0.2 rad and 20 degrees."""
     place = at(se3.exp(np.array(xi, dtype=float)), depth=2.0)
     assert Reach(np.eye(4), 0.36, 0.2, 1.0).holds(place) == inside
 
 
-def test_every_keyframe_is_asked_in_turn(points):
+def test_every_keyframe_is_matched_in_rotation(points):
     tracker = tracker_of(points)
     tried = {k.id for n in range(1, 8) for k in candidates(tracker, points.world.T_c_w[0], 2, n)}
     assert tried == set(range(6))

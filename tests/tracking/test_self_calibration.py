@@ -65,14 +65,14 @@ def test_no_matrix_no_focal_length():
 
 
 @pytest.mark.parametrize("focal", [320.0, 517.0, 800.0])
-def test_noise_free_matches_give_it_within_a_percent(focal, rng):
+def test_noise_free_matches_give_the_focal_length_within_a_percent(focal, rng):
     estimate = focal_from_matches(pairs(rng, focal), WIDTH, HEIGHT)
     assert estimate.reason == ""
     assert estimate.focal_px == pytest.approx(focal, rel=0.01)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_half_a_pixel_of_noise_leaves_it_within_ten_percent_and_three_sigma(seed):
+def test_with_half_a_pixel_of_noise_the_error_is_below_ten_percent_and_three_sigma(seed):
     rng = np.random.default_rng(seed)
     estimate = focal_from_matches(pairs(rng, 517.0, 30, 0.5), WIDTH, HEIGHT)
     assert estimate.focal_px == pytest.approx(517.0, rel=0.10)
@@ -107,7 +107,7 @@ def plane(rng):
         (motion, lambda rng: cloud(rng, 30), "too few matches"),
     ],
 )
-def test_pairs_that_say_nothing_are_refused_by_name(make_motion, make_points, words, rng):
+def test_degenerate_pairs_are_rejected_with_a_reason(make_motion, make_points, words, rng):
     estimate = focal_from_matches(pairs(rng, 517.0, 8, 0.3, make_motion, make_points), WIDTH, HEIGHT)
     assert estimate.focal_px is None
     assert np.isinf(estimate.sigma_px)
@@ -123,12 +123,12 @@ def test_good_pairs_suffice_when_most_are_useless(rng):
     assert focal_from_matches(mixed[::-1], WIDTH, HEIGHT) == estimate  # whatever the order
 
 
-def test_matches_at_random_are_refused(rng):
+def test_random_matches_are_rejected(rng):
     nonsense = [tuple(rng.uniform([0, 0], [WIDTH, HEIGHT], (2, 80, 2))) for _ in range(6)]
     assert focal_from_matches(nonsense, WIDTH, HEIGHT).focal_px is None
 
 
-def test_nothing_at_all():
+def test_no_pairs_give_no_estimate():
     assert focal_from_matches([], WIDTH, HEIGHT) == FocalEstimate(None, np.inf, 0, "0 of 0 image pairs usable")
 
 
@@ -162,7 +162,7 @@ def test_rendered_flight_gives_it_within_fifteen_percent():
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_too_few_images_fall_back_and_say_why(count):
+def test_too_few_images_fall_back_with_a_reason(count):
     camera = guess_camera([f.image for f in strolling().frames[:count]], 320, 240)
     assert camera.fx == 384.0
     assert camera.source.startswith("guess: 1.2*max(w,h) = 384 px (")
@@ -208,7 +208,7 @@ def test_a_calibration_of_another_lens_is_contradicted(rng, factor):
     assert suggested == pytest.approx(500.0, rel=0.06)
 
 
-def test_the_right_calibration_is_left_in_peace(rng):
+def test_a_correct_calibration_gives_no_warning(rng):
     assert calibration_warning(TRUE_LENS, walked_keyframes(rng)) is None
 
 
@@ -225,7 +225,7 @@ def adapted(camera, keyframes, p_w):
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.0, 1.3])
-def test_a_refined_map_tells_the_focal_length_and_its_sigma(factor):
+def test_a_refined_map_gives_the_focal_length_and_its_sigma(factor):
     keyframes = walked_keyframes(np.random.default_rng(3), 24)
     camera = another_lens(factor)
     estimate = focal_from_map(camera, keyframes, adapted(camera, keyframes, cloud(np.random.default_rng(3))))
@@ -234,12 +234,12 @@ def test_a_refined_map_tells_the_focal_length_and_its_sigma(factor):
     assert contradicts(estimate, camera) is (factor != 1.0)
 
 
-def test_a_guess_that_says_so_is_not_contradicted(rng):
+def test_a_guessed_focal_length_is_not_contradicted(rng):
     assert calibration_warning(another_lens(1.3, focal_sigma=GUESSED_FOCAL_SIGMA), walked_keyframes(rng)) is None
 
 
 @pytest.mark.parametrize("count", [0, 1, 14])
-def test_without_motion_nothing_is_said(rng, count):
+def test_without_motion_there_is_no_warning(rng, count):
     assert calibration_warning(another_lens(1.3), walked_keyframes(rng, count, still=True)) is None
 
 
@@ -253,7 +253,7 @@ def test_without_motion_nothing_is_said(rng, count):
         (400.0, 20.0, 30, True),
     ],
 )
-def test_only_a_sure_and_large_difference_counts(focal, sigma, pairs, is_doubted):
+def test_only_a_significant_large_difference_is_a_contradiction(focal, sigma, pairs, is_doubted):
     assert contradicts(FocalEstimate(focal, sigma, pairs, ""), TRUE_LENS) is is_doubted
 
 

@@ -54,7 +54,7 @@ def test_pose_of_a_noise_free_frame_is_exact(points, rng):
     assert len(np.unique(track.keypoint)) == len(np.unique(track.anchor)) == track.inliers <= len(seen)
 
 
-def test_noise_of_half_a_pixel_moves_it_by_millimetres(points, rng):
+def test_half_a_pixel_of_noise_moves_the_pose_by_millimetres(points, rng):
     predicted = small_motion(rng, 0.02, 0.01) @ points.world.T_c_w[3]
     track = tracker_of(points).track(view_of(points, 3, rng, 0.5, 20), predicted, recent(points, 3))
     translation, rotation = pose_error(points, 3, track.T_c_w)
@@ -65,7 +65,7 @@ def test_noise_of_half_a_pixel_moves_it_by_millimetres(points, rng):
     assert (sigma < 0.05).all()
 
 
-def test_prediction_that_is_far_off_gives_none_rather_than_a_wrong_pose(points, rng):
+def test_a_wrong_prediction_gives_no_pose(points, rng):
     far = se3.exp(np.array([0, 0, 0, 0, 1.2, 0])) @ points.world.T_c_w[3]
     assert tracker_of(points).track(view_of(points, 3, rng), far, recent(points, 3)) is None
 
@@ -79,7 +79,7 @@ def test_frame_without_keypoints_has_no_pose(points, rng):
     assert match_keyframe(tracker, view, points.keyframes[3]) is None
 
 
-def test_another_place_is_not_this_one(points, rng):
+def test_another_place_gives_no_pose(points, rng):
     """A frame of random descriptors at the right pixels."""
     seen = view_of(points, 3, rng).features
     bits = rng.integers(0, 256, seen.descriptors.shape, dtype=np.uint8)
@@ -132,7 +132,7 @@ def test_median_parallax_counts_from_where_the_camera_is():
         assert median_parallax(p_w, T_c_w, np.zeros(3)) == pytest.approx(angle)
 
 
-def test_an_anchor_is_expected_at_the_level_that_its_distance_tells(points):
+def test_an_anchor_is_expected_at_the_level_of_its_distance(points):
     """Seen at level 0 from its reference distance; at 1 / 1.44 of that it fills level 2."""
     anchors = points.map.anchors
     ids = np.flatnonzero(anchors.alive)
@@ -162,7 +162,7 @@ def test_an_anchor_is_expected_within_60_degrees_of_how_it_was_seen(points, off_
     assert (len(project_anchors(anchors, ids, T, CAMERA, SCALE_FACTOR, 8).anchor) > 50) == expected
 
 
-def test_on_guessed_depths_the_expected_motion_holds_the_pose(points, rng):
+def test_on_predicted_depths_the_motion_prior_constrains_the_pose(points, rng):
     """Every depth is a guess: images hardly tell a turn from a shift, and what accelerations allow has a say."""
     anchors = points.map.anchors
     ids = np.flatnonzero(anchors.alive)
