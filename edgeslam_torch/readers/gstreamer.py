@@ -1,6 +1,6 @@
 """A GStreamer pipeline as a camera: ``gst-launch-1.0`` runs it and sends its pictures through a pipe.
 
-The wheels of OpenCV have no GStreamer; any installed one serves here.
+OpenCV's wheels are built without GStreamer; any installed version works.
 """
 
 import shlex
@@ -79,7 +79,7 @@ class GStreamerCapture:
                 self._process.wait()
 
     def _complaint(self) -> str:
-        """What GStreamer said."""
+        """GStreamer's error output."""
         self._said.seek(0)
         lines = self._said.read().decode("utf-8", "replace").splitlines()
         return next((" ".join(line.split())[:160] for line in lines if "ERROR" in line or "WARN" in line), "no reason")

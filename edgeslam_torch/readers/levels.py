@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 FIRST = 10
 """Pictures at the start of a recording that decide."""
 _OUTLIERS_PERCENT = 0.1
-"""Hot and dead pixels at either end that do not count."""
+"""Percentage of pixels ignored at either end: hot and dead pixels."""
 _SAMPLES = 65536
-"""Pixels of a picture that are looked at."""
+"""Maximum number of sampled pixels of an image."""
 _NARROW = 0.25
 """Values that fill less than this share of their bits lie far from zero, as a thermal camera's do."""
 _MARGIN = 0.25
@@ -26,7 +26,7 @@ class Levels:
     black: float
     white: float
     words: str
-    """What is done, for the user."""
+    """Description of the conversion for the user."""
 
     def eight_bits(self, picture: NDArray[Any]) -> NDArray[np.uint8]:
         """The picture in 0 to 255; one of eight bits as it is."""

@@ -25,7 +25,7 @@ FIRST_PICTURE_S = 10.0
 SILENCE_S = 10.0
 """After this time without a picture the source has ended."""
 RESTART_S = 40.0
-"""The same for a drone: so long it may take to be restarted, and this computer to be in its Wi-Fi again."""
+"""The same for a drone: the time to restart it and to reconnect to its Wi-Fi."""
 _MAX_NAME = 60
 """Characters of an address in a folder's name."""
 _SLICE_S = 0.1

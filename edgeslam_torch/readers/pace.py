@@ -1,4 +1,4 @@
-"""How frames are handed on: with the telemetry that arrived since the last, or at their original rate."""
+"""Delivery of frames: with the telemetry received since the last one, or at their original rate."""
 
 import queue
 import threading
@@ -11,8 +11,7 @@ from edgeslam_torch.types import Frame, TelemetrySample
 REALTIME_QUEUE = 15
 """Frames that may wait for a slow step, half a second at 30 a second.
 
-The step that starts the map takes 0.3 s on a PC; tracking a frame takes a third of the time between two, so that what
-waited is soon caught up with.
+Initialisation takes 0.3 s on a PC; tracking takes a third of the frame interval, so that the queue drains quickly.
 """
 
 

@@ -90,11 +90,11 @@ class Recording(Steps):
     live: bool = False
     max_frames: int | None = None
     start: int = 0
-    """Frames left out at the beginning."""
+    """Number of skipped frames at the start."""
     stride: int = 1
-    """Of those that are left, one in so many is used."""
+    """Interval of used frames among the others."""
     force: SpecificForce | None = None
-    """What an accelerometer beside the images felt."""
+    """Readings of an accelerometer beside the images."""
 
     def __post_init__(self) -> None:
         self._listed = tuple(self.problems)

@@ -92,7 +92,7 @@ class TelemetryTable:
     stated: frozenset[str] = frozenset()
     """Columns whose unit the file states."""
     remarks: tuple[str, ...] = ()
-    """What the file holds that cannot be used, in sentences."""
+    """Remarks about unusable content, one sentence each."""
 
     def samples(self, units: TelemetryUnits | None = None) -> list[TelemetrySample]:
         """SI units and our axes."""

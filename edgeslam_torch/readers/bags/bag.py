@@ -55,7 +55,7 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Raw:
-    """One message as it lies in the file."""
+    """One undecoded message."""
 
     topic: str
     received_s: float

@@ -1,4 +1,4 @@
-"""What a bag from somebody else may ask for: decompression, SQL and message definitions within bounds.
+"""Limits for untrusted bags: decompression, SQL and message definitions.
 
 rosbags decompresses a chunk of any size, runs whatever a database calls its tables, and compiles message definitions to
 Python. A file of a few kilobytes can thus take all memory, never end, or reach the compiler with names of its own.

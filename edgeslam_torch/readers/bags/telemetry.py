@@ -16,7 +16,7 @@ from edgeslam_torch.types import FloatArray, TelemetrySample
 _EVERY_S = 0.045
 """Minimum interval between samples; a Tello sends 10 Hz, and a higher rate has no benefit."""
 _HOLD_S = 0.25
-"""Age up to which another topic's last message still describes the moment."""
+"""Maximum age of another topic's last message."""
 _WORLD_FRAMES = ("map", "odom", "world", "earth", "local_origin", "enu")
 _NAMES = {"odom": "Odometry", "velocity": "TwistStamped", "imu": "Imu", "tello": "FlightData"}
 
@@ -26,7 +26,7 @@ Row = tuple[float, ...]
 def read_bag_telemetry(
     bag: Bag, topics: Mapping[str, str], asked: frozenset[str], clocks: Mapping[str, TopicClock]
 ) -> tuple[list[TelemetrySample], list[str]]:
-    """All telemetry of a recording in time order, and what there is to say about it.
+    """All telemetry of a recording in time order, and remarks.
 
     Args:
         bag: The recording.

@@ -1,4 +1,4 @@
-"""Which topic of a bag is what: by type, and by ``--topic``."""
+"""Roles of a bag's topics, by type and by ``--topic``."""
 
 import difflib
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ _MESSAGE_OF_THE_DRIVER = "FlightData"
 _NOTHING = "none"
 _COMPRESSED = "/compressed"
 _OURS = "/edgeslam/"
-"""Results of ``--save-mcap``: what a run found is no measurement for the next one."""
+"""Prefix of results of ``--save-mcap``, which are not measurements."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Choice:
 
 
 def role_of(topic: Topic) -> str | None:
-    """What a topic can be used as, by its type; None for anything else."""
+    """Role of a topic by its type; None without one."""
     if topic.name.startswith(_OURS):
         return None
     if topic.kind.rpartition("/")[2] == _MESSAGE_OF_THE_DRIVER:
@@ -151,7 +151,7 @@ def _camera(bag: Bag, image: str, request: str | None) -> str | None:
 
 
 def _telemetry(bag: Bag, requests: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
-    """Topic of each role, and what is not used because there are several."""
+    """Topic of each role, and remarks about topics that are ignored because there are several."""
     chosen: dict[str, str] = {}
     remarks = []
     for role in TELEMETRY:

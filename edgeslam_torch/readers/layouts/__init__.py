@@ -1,4 +1,4 @@
-"""One module per data set: how its folder is recognised, and where its images, stamps, camera, truth and depth are.
+"""One module per data set: detects its folder and locates images, stamps, camera, ground truth and depth.
 
 A module in this folder is a layout. It has ``KIND``, ``recognises(folder)`` and ``read(folder)`` as `Layout` says; no
 other file refers to it. The first module, by name, that recognises a folder reads it.
@@ -48,7 +48,7 @@ def read_sequence(folder: Path) -> Sequence | None:
     """The recording in a folder; None when no layout recognises it.
 
     Raises:
-        SourceError: If what names the images is missing or malformed.
+        SourceError: If the list of images is missing or malformed.
     """
     layout = layout_of(folder)
     return None if layout is None else layout.read(folder)

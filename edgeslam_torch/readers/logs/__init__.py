@@ -1,1 +1,1 @@
-"""What the columns of telemetry tables are, and which logs are of other programs."""
+"""Columns of telemetry tables, and detection of other programs' logs."""

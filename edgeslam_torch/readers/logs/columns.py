@@ -33,11 +33,11 @@ QUANTITIES = {
     "bat": ("share", 0.01),
     **dict.fromkeys(("agx", "agy", "agz"), _ACCELERATION),
 }
-"""What each field of the SDK is, and its unit there in SI: dm/s, degrees, cm, metres, percent, thousandths of g."""
+"""Quantity of each SDK field and its SDK unit in SI: dm/s, degrees, cm, metres, percent, thousandths of g."""
 
 
 def column_of(header: str) -> tuple[str, float, bool] | None:
-    """What a column's name says.
+    """Field and unit by a column's name.
 
     Returns:
         Field of the SDK, SDK units per unit of the column (NaN where a unit is stated that is not known), and whether a

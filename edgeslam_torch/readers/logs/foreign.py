@@ -1,4 +1,4 @@
-"""Flight logs of other programs: what they are, and how to make a telemetry table of them."""
+"""Detection of other programs' flight logs, with instructions for their conversion."""
 
 import re
 from pathlib import Path
@@ -28,7 +28,7 @@ _MAVLINK = re.compile(rb"^.{8}[\xfe\xfd]", re.S)
 
 
 def foreign_log(path: Path) -> str | None:
-    """What kind of other log a file is and how to convert it, in one line; None for anything else."""
+    """Kind of a foreign log and how to convert it, in one line; None for other files."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES) if path.is_file() else b""
