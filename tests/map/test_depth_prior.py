@@ -101,8 +101,8 @@ def test_a_wrong_network_is_corrected_by_anchors_with_a_larger_sigma(points, twi
     known = np.isfinite(prior)
     left = np.abs(np.log(prior / z))[known]
     assert np.median(left) <= 0.5 * np.median(np.abs(error)) + 0.01
-    assert np.median(prior_sigma[known]) == pytest.approx(sigma_log, abs=0.003)
-    assert np.mean(left < 2.5 * prior_sigma[known]) > 0.95
+    assert np.median(prior_sigma[known]) == pytest.approx(sigma_log, rel=0.15)
+    assert np.mean(left < 2.5 * prior_sigma[known]) > 0.9
 
 
 def relative_map(points, view, scale=0.7, shift=0.02):
