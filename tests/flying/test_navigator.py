@@ -167,7 +167,7 @@ def test_a_low_battery_brings_it_home_and_down():
         outcome = nav.go_to((2.0, 2.0, 1.15))
         assert not outcome.reached and "battery low" in outcome.reason
         assert not nav.vehicle.flying and np.linalg.norm(nav.vehicle.p[:2]) < 0.2
-        with pytest.raises(FlightRefused, match="over"):
+        with pytest.raises(FlightRefused, match="has ended"):
             nav.take_off()
 
 
