@@ -90,7 +90,7 @@ def _conditions(release: dict[str, Any]) -> str:
     machine = release["machine"]
     return _block(
         f"Version {release['version']}, {release['date']}, {machine['cores']} cores ({machine['cpu']}), "
-        f"one pass of ORB {machine['orb_ms']:.0f} ms."
+        f"one pass of ORB {machine['orb_ms']:.0f} ms. {release.get('note', '')}".rstrip()
     )
 
 

@@ -77,8 +77,8 @@ def edges(
 ) -> Rows:
     """Pairs of an edge pixel and its partner: alignment, and the cycle if enabled."""
     T, at, d, camera = _tensor(T_j_i[view]), _tensor(uv[edge])[:, None], _tensor(inverse_depth[edge]), _matrix(K)
-    partner, held = (_tensor(uv_j)[:, None], _tensor(normal_j)[:, None]), _tensor(inverse_depth_j)[:, None]
-    depth_j = torch.where(held > 0, 1.0 / torch.where(held > 0, held, 1.0), 0.0)
+    partner, known = (_tensor(uv_j)[:, None], _tensor(normal_j)[:, None]), _tensor(inverse_depth_j)[:, None]
+    depth_j = torch.where(known > 0, 1.0 / torch.where(known > 0, known, 1.0), 0.0)
     # No occlusion mask: pairs were chosen by their depths.
     round_trip = CycleLoss(_FORMS[cycle], max_relative=float("inf")) if cycle in _FORMS else None
 

@@ -24,7 +24,7 @@ from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray, IntArray
 
 _LEAST_WEIGHT = 1e-3
-_LEAST_WAY = 0.5
+_MIN_EXPLAINED = 0.5
 """Minimum share of the visual path explained by the fit."""
 MIN_DISPLACEMENTS = 6
 _MIN_HEIGHTS = 4
@@ -177,7 +177,7 @@ def displacement_evidence(
         return None
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(3.0 * float(weight.sum()), 1e-9))
     bias_m_s = fit.bias[:, -1] / duration_s[-1]
-    torn = float(weight @ np.sum(moved_map**2, axis=1)) < _LEAST_WAY * length
+    torn = float(weight @ np.sum(moved_map**2, axis=1)) < _MIN_EXPLAINED * length
     evidence = Evidence(fit.information, fit.vector, rms, bias_m_s, fit.log_likelihood, wander, torn=torn)
     return evidence.softened(_unrest(sigma_m**2 + (s * sigma_map) ** 2, fit, J, latent, target))
 

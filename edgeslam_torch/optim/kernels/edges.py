@@ -79,15 +79,15 @@ def edges(
         J[k, 0, 3], J[k, 0, 4], J[k, 0, 5] = -b - along * y, a + along * x, b * x - a * y
         J[k, 0, 6] = a * x_d + b * y_d
 
-        held = inverse_depth_j[k]
-        if cycle == RELATIVE_DEPTH and held > 0.0:  # (z - z_j) / (z + z_j), by inverse depths
-            both = 1.0 / (held + iz)
-            r[k, 1] = (held - iz) * both * cycle_inv_sigma
-            slope = -2.0 * held * both * both * cycle_inv_sigma  # by iz
+        known = inverse_depth_j[k]
+        if cycle == RELATIVE_DEPTH and known > 0.0:  # (z - z_j) / (z + z_j), by inverse depths
+            both = 1.0 / (known + iz)
+            r[k, 1] = (known - iz) * both * cycle_inv_sigma
+            slope = -2.0 * known * both * both * cycle_inv_sigma  # by iz
             J[k, 1, 2], J[k, 1, 3], J[k, 1, 4] = -slope * iz * iz, -slope * iz * y, slope * iz * x
             J[k, 1, 6] = slope * scale * (1.0 - iz * T[2, 3])
-        if cycle == PIXEL and held > 0.0:  # to the target's depth and back into the host
-            px, py, pz = x - T[0, 3] * held, y - T[1, 3] * held, 1.0 - T[2, 3] * held
+        if cycle == PIXEL and known > 0.0:  # to the target's depth and back into the host
+            px, py, pz = x - T[0, 3] * known, y - T[1, 3] * known, 1.0 - T[2, 3] * known
             Z = T[0, 2] * px + T[1, 2] * py + T[2, 2] * pz
             if not Z > MIN_DEPTH:
                 continue
@@ -99,9 +99,9 @@ def edges(
                 for m in range(3):  # by the point at the target's depth
                     D[m] = (T[m, i] - back * T[m, 2]) * f / Z
                 # The projection depends on the pose, and the back-projection on its inverse: opposite signs.
-                J[k, 1 + i, 0] = D[0] * (iz - held)
-                J[k, 1 + i, 1] = D[1] * (iz - held)
-                J[k, 1 + i, 2] = -(D[0] * x + D[1] * y) * iz - D[2] * held
+                J[k, 1 + i, 0] = D[0] * (iz - known)
+                J[k, 1 + i, 1] = D[1] * (iz - known)
+                J[k, 1 + i, 2] = -(D[0] * x + D[1] * y) * iz - D[2] * known
                 J[k, 1 + i, 3] = -D[0] * x * y - D[1] * (1.0 + y * y) - D[2] * y + D[1]
                 J[k, 1 + i, 4] = D[0] * (1.0 + x * x) + D[1] * x * y - D[0] + D[2] * x
                 J[k, 1 + i, 5] = 0.0
