@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.estimation.config import FusionConfig
 
 
 def _check_numbers(config: Any, prefix: str = "") -> None:

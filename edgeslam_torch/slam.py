@@ -19,14 +19,14 @@ from edgeslam_torch.atlas.prior_map import PriorMaps
 from edgeslam_torch.atlas.saved import SavedAtlas, Unit, pack, unpack
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.estimation.motion import MotionFusion
+from edgeslam_torch.estimation.output_frame import OutputFrame, first_pose
+from edgeslam_torch.estimation.snapshot import Present
 from edgeslam_torch.frontend.depth_check import CheckedDepth, DepthFunction
 from edgeslam_torch.frontend.edges import extract_edges
 from edgeslam_torch.frontend.image import as_grey
 from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.frontend.repeats import REPEATED, RepeatedImages
-from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.fusion.output_frame import OutputFrame, first_pose
-from edgeslam_torch.fusion.snapshot import Present
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.level import SpecificForce, Up

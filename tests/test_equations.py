@@ -15,10 +15,10 @@ from posed_run import write_run
 
 from edgeslam_torch.config import SlamConfig, WindowConfig
 from edgeslam_torch.demo import DemoSettings, record
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.eval.metrics.trajectory_error import score_trajectory
-from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.mapping.last_refinement import lm_config, refine_with_edges
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata

@@ -113,6 +113,6 @@ def test_the_way_goes_on_in_a_higher_row_few_times():
     assert 3 < climbs <= CLIMBS, list(entered)
 
 
-@pytest.mark.parametrize("name", ["slam", "states/tracking", "optim/pose_only", "fusion/output_frame"])
+@pytest.mark.parametrize("name", ["slam", "states/tracking", "optim/pose_only", "estimation/output_frame"])
 def test_the_list_names_what_matters(name):
     assert f"edgeslam_torch.{name.replace('/', '.')}" in [*listed(), "edgeslam_torch.slam"]

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.config import DepthConfig, OrbConfig, SlamConfig
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.estimation.output_frame import T_LEVEL, first_pose
 from edgeslam_torch.eval.metrics.align import umeyama
-from edgeslam_torch.fusion.output_frame import T_LEVEL, first_pose
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.geometry.rotations import rpy_from_matrix

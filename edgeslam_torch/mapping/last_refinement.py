@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from edgeslam_torch.config import WindowConfig
-from edgeslam_torch.fusion.displacement import TelemetryModel
+from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.robust_statistics import Kernel
 from edgeslam_torch.map.slam_map import SlamMap

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import Matches
 from edgeslam_torch.frontend.orb import spread
-from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.map.depth_prior import depth_prior

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.fusion.acceleration_prior import inertia
-from edgeslam_torch.fusion.displacement import TelemetryModel
-from edgeslam_torch.fusion.heading import headings
+from edgeslam_torch.estimation.acceleration_prior import inertia
+from edgeslam_torch.estimation.displacement import TelemetryModel
+from edgeslam_torch.estimation.heading import headings
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
 

@@ -6,9 +6,9 @@ Synchronous, or on the single thread of an executor while the next frames are tr
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
+from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.frontend.depth_check import CheckedDepth
 from edgeslam_torch.frontend.image import as_grey, colours_at
-from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.depth_prior import sample
 from edgeslam_torch.map.keyframe import Keyframe

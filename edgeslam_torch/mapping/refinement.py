@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgeslam_torch.fusion.displacement import TelemetryModel
+from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95, Kernel
 from edgeslam_torch.map.keyframe import Keyframe

@@ -9,7 +9,7 @@ from edgeslam_torch.atlas.atlas import Atlas, Join
 from edgeslam_torch.atlas.loops import Closure
 from edgeslam_torch.atlas.submap_heading import Turned
 from edgeslam_torch.atlas.submap_scale import Rescaled
-from edgeslam_torch.fusion.output_frame import OutputFrame
+from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.states.system import System
 from edgeslam_torch.types import FloatArray

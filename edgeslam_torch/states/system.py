@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.fusion.displacement import TelemetryModel
-from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.fusion.output_frame import OutputFrame
-from edgeslam_torch.fusion.prediction import PoseEstimate
-from edgeslam_torch.fusion.scale.depth_scale import DepthRatio, compared
+from edgeslam_torch.estimation.displacement import TelemetryModel
+from edgeslam_torch.estimation.motion import MotionFusion
+from edgeslam_torch.estimation.output_frame import OutputFrame
+from edgeslam_torch.estimation.prediction import PoseEstimate
+from edgeslam_torch.estimation.scale.depth_scale import DepthRatio, compared
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe

@@ -17,11 +17,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.motion import MotionFusion
+from edgeslam_torch.estimation.output_frame import OutputFrame
+from edgeslam_torch.estimation.snapshot import Present
 from edgeslam_torch.eval.benchmark.pose_now import Errors, Request, Truth, judge, simulated_telemetry
-from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.fusion.output_frame import OutputFrame
-from edgeslam_torch.fusion.snapshot import Present
 from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ
 from edgeslam_torch.synthetic.flights.flight import FlightPlan
 from edgeslam_torch.types import FloatArray, TelemetrySample
@@ -30,7 +30,7 @@ JITTER_M, JITTER_RAD = 0.002, 0.001
 DRIFT = 0.01
 """Of the way from one frame to the next, as a random walk."""
 WANDER = 0.03
-"""Change of the log scale while the map's age grows by a factor of e: the usual one of `fusion.scale.joint_scale`."""
+"""Change of the log scale while the map's age grows by a factor of e: as in `estimation.scale.joint_scale`."""
 _EVERY = 5
 """Frames from one question to the next."""
 _SECONDS = 24.0

@@ -11,9 +11,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from edgeslam_torch.config import MappingConfig, SlamConfig, WindowConfig
-from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.displacement import TelemetryModel
-from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.displacement import TelemetryModel
+from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.map.keyframe import NO_ANCHOR

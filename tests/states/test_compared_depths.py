@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from point_map import PointMap
 
-from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.states.system import System
 

@@ -8,9 +8,9 @@ import pytest
 from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.config import DepthConfig, SlamConfig
+from edgeslam_torch.estimation.motion import MotionFusion
+from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
 from edgeslam_torch.eval.metrics.align import umeyama
-from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.fusion.scale_estimator import ScaleEstimator
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.types import DepthMap, TelemetrySample, Units

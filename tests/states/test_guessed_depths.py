@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.fusion.output_frame import OutputFrame
+from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.states.starting import Starting
 from edgeslam_torch.types import DepthMap
 

@@ -9,7 +9,7 @@ from edgeslam_torch.atlas.atlas import Join
 from edgeslam_torch.atlas.loops import Closure
 from edgeslam_torch.atlas.submap_heading import Turned, turn_about
 from edgeslam_torch.atlas.submap_scale import Rescaled, about
-from edgeslam_torch.fusion.output_frame import OutputFrame
+from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.states.map_merging import MapMerging
 from edgeslam_torch.states.submap_uncertainty import SubmapUncertainty

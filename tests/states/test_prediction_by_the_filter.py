@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgeslam_torch.fusion.output_frame import OutputFrame
+from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.states.drift import SHARE
 from edgeslam_torch.states.system import System

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.atlas.saved import BEFORE_S
-from edgeslam_torch.fusion.prediction import PoseEstimate
+from edgeslam_torch.estimation.prediction import PoseEstimate
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.states.tracking import Tracking
 

@@ -8,7 +8,7 @@ import pytest
 from rendered import CAMERA, film, patchwork, sideways, stairs_world
 
 from edgeslam_torch.config import DepthConfig, MappingConfig, SlamConfig
-from edgeslam_torch.fusion.dead_reckoning import Reckoned
+from edgeslam_torch.estimation.dead_reckoning import Reckoned
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World

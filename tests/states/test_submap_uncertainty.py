@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgeslam_torch.fusion.output_frame import OutputFrame
-from edgeslam_torch.fusion.prediction import PoseEstimate
+from edgeslam_torch.estimation.output_frame import OutputFrame
+from edgeslam_torch.estimation.prediction import PoseEstimate
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.states.submap_uncertainty import SubmapUncertainty
 from edgeslam_torch.states.system import System

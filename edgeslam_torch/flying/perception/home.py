@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.fusion.output_frame import CONTRADICTION, SURE
+from edgeslam_torch.estimation.output_frame import CONTRADICTION, SURE
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray, SlamOutput
 

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.estimation.health import disagreement
 from edgeslam_torch.flying.perception.home import GROUND_M, TAKE_OFF, Home, Place, metres_per_unit
 from edgeslam_torch.flying.perception.map_reset import MapReset
 from edgeslam_torch.frontend.depth_network import DepthNetwork, open_depth, weights_path
-from edgeslam_torch.fusion.health import disagreement
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.mount import camera_on_body

@@ -1,0 +1,197 @@
+"""Feeds tracked poses to the Kalman filter as metric increments, and expresses its predictions in the map.
+
+The filter estimates only the motion of the body since the last visual pose, not the pose of the map in the drone's
+world. This suffices for predictions in the map, and stays valid when the map is moved, rotated or scaled.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.filter.delayed import BufferedEkf, PoseSigma
+from edgeslam_torch.estimation.telemetry.delay import Delay
+from edgeslam_torch.estimation.telemetry.visual_memory import VisualPose
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import matrix_from_rpy, rotation_vector
+from edgeslam_torch.types import FloatArray, ScaleEstimate, TelemetrySample
+
+_SAME_S = 1e-6
+_SURE = 0.2
+"""Maximum relative sigma of the scale: over a video's delay, 0.2 m of flight at most, that is an error of 4 cm."""
+_DELAY_MOVED_S = 0.003
+"""Change of the estimated delay after which increments restart: one across it would cover a wrong interval."""
+_DRIFT = 0.01
+"""Standard deviation of the drift from frame to frame, as a share of the distance travelled."""
+_DRIFT_TURN = 0.003
+"""The same as a share of the angle turned."""
+_JITTER_M, _JITTER_RAD = 0.002, 0.001
+"""Minimum noise of a tracked pose."""
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """Conversion of the map's units and clock to the drone's."""
+
+    scale: ScaleEstimate
+    """Metres per map unit."""
+    delay: Delay
+
+    @property
+    def sure(self) -> bool:
+        """Whether increments may enter the filter."""
+        return self.scale.sigma < _SURE * self.scale.value and math.isfinite(self.delay.sigma_s)
+
+
+@dataclass(frozen=True, slots=True)
+class FilterView:
+    """The filter's estimate at one stamp, relative to a visual pose of the map."""
+
+    seen: VisualPose
+    """The last visual pose of the camera."""
+    to_s: float
+    """Stamp of the estimate on the frames' clock."""
+    T_seen_c: FloatArray
+    """``(4, 4)`` camera, relative to the camera at `seen` [m]."""
+    velocity_m_s: FloatArray
+    """``(3,)`` of the body, in the axes of the camera at `seen`."""
+    covariance: FloatArray
+    """``(9, 9)`` of translation [m], rotation vector [rad] and velocity [m/s], in the axes of the camera at `seen`."""
+
+
+class FilterFeed:
+    """Converts visual poses to filter updates, relative to the pose at the last update."""
+
+    def __init__(self, config: FusionConfig, T_b_c: FloatArray) -> None:
+        self._config, self._T_b_c = config, T_b_c
+        self.ekf = BufferedEkf(config)
+        self._seen: VisualPose | None = None
+        self._delay: Delay | None = None
+        """Delay by which the stamp of that pose was converted to telemetry's clock."""
+        self._accumulated: FloatArray | None = None
+        """Visual odometry accumulated by the paper's filter: body in the power-on world [m]."""
+
+    @property
+    def seen(self) -> VisualPose | None:
+        """Pose at the last update."""
+        return self._seen
+
+    def move_map(self, seen: VisualPose | None) -> None:
+        """Replace the pose at the last update after the map was refined, moved or scaled."""
+        self._seen = seen
+
+    def clear(self) -> None:
+        """Reset the last pose: a new map has another gauge."""
+        self._seen = self._delay = self._accumulated = None
+
+    def add_telemetry(self, sample: TelemetrySample, shortfall_m_s: float) -> None:
+        """Add one state message; non-zero velocities are corrected by a truncation loss of ``shortfall_m_s``."""
+        self.ekf.add_telemetry(_corrected(sample, shortfall_m_s))
+
+    def see(self, visual: VisualPose, metric: Metric) -> None:
+        """Update the filter with a tracked frame."""
+        seen = self._seen
+        if not metric.sure:
+            self._seen = None
+            return
+        moved_clock = self._delay is None or abs(self._delay.value_s - metric.delay.value_s) > _DELAY_MOVED_S
+        if moved_clock or self._delay is None:
+            self._delay = metric.delay
+        stamp_s = visual.stamp_s - self._delay.value_s
+        self._seen = visual
+        if seen is None or moved_clock:
+            self._accumulated = None
+            self.ekf.see(stamp_s)
+            return
+        scale = metric.scale
+        T_c = se3.inverse(seen.T) @ visual.T
+        T_c[:3, 3] *= scale.value
+        T_b = self._T_b_c @ T_c @ se3.inverse(self._T_b_c)
+        jitter = PoseSigma(
+            math.hypot(visual.sigma_t * scale.value, _JITTER_M), math.hypot(visual.sigma_r_rad, _JITTER_RAD)
+        )
+        from_s = seen.stamp_s - self._delay.value_s
+        if self._config.literal:
+            self._add_accumulated(from_s, stamp_s, T_b, jitter)
+            return
+        share = math.hypot(_DRIFT, scale.sigma / scale.value)
+        turned = float(np.linalg.norm(rotation_vector(T_c[:3, :3])))
+        drift = PoseSigma(share * float(np.linalg.norm(T_c[:3, 3])), _DRIFT_TURN * turned)
+        self.ekf.add_relative(from_s, stamp_s, T_b, drift, jitter)
+
+    def _add_accumulated(self, from_s: float, to_s: float, T_b: FloatArray, sigma: PoseSigma) -> None:
+        """Paper eq. (13): the chained increments are measured as an absolute pose."""
+        if self._accumulated is None:
+            start = self.ekf.state_at(from_s)
+            if start is None:
+                return
+            self._accumulated = np.eye(4)
+            self._accumulated[:3, :3], self._accumulated[:3, 3] = matrix_from_rpy(start.rpy_rad), start.p_w
+        self._accumulated = self._accumulated @ T_b
+        self.ekf.add_absolute(to_s, self._accumulated, sigma)
+
+    def view(self, stamp_s: float) -> FilterView | None:
+        """The camera at a frame's stamp; ``None`` before the first update, and where telemetry ends too early."""
+        return view(self.ekf, self._seen, self._delay, stamp_s, self._T_b_c, self._config.max_gap_s)
+
+    def frozen(self) -> "FrozenFilter | None":
+        """The filter as it is now, for another thread."""
+        if self._seen is None or self._delay is None:
+            return None
+        return FrozenFilter(self.ekf.resumed(), self._seen, self._delay, self._T_b_c, self._config.max_gap_s)
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenFilter:
+    """An immutable copy of the filter."""
+
+    ekf: BufferedEkf
+    seen: VisualPose
+    delay: Delay
+    T_b_c: FloatArray
+    max_gap_s: float
+
+    def view(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> FilterView | None:
+        """The camera on telemetry's clock, at ``stamp_s`` or at the filter's newest event if that is later.
+
+        Args:
+            stamp_s: Requested time.
+            telemetry: State messages since the copy.
+        """
+        ekf = self.ekf.resumed()
+        for sample in telemetry:
+            ekf.add_telemetry(sample)
+        at_s = max(stamp_s, ekf.stamp_s or stamp_s) + self.delay.value_s
+        return view(ekf, self.seen, self.delay, at_s, self.T_b_c, self.max_gap_s)
+
+
+def view(
+    ekf: BufferedEkf, seen: VisualPose | None, delay: Delay | None, stamp_s: float, T_b_c: FloatArray, max_gap_s: float
+) -> FilterView | None:
+    """The filter's estimate at a frame's stamp; ``None`` where telemetry ends more than ``max_gap_s`` before."""
+    if seen is None or delay is None:
+        return None
+    at_s = stamp_s - delay.value_s
+    if not at_s <= ekf.telemetry_s + max_gap_s:
+        return None
+    moved = ekf.since_visual(at_s)
+    if moved is None or not abs(moved.from_s + delay.value_s - seen.stamp_s) < _SAME_S:
+        return None
+    T_c_b = se3.inverse(T_b_c)
+    turn = np.kron(np.eye(3), T_c_b[:3, :3])
+    return FilterView(
+        seen,
+        stamp_s,
+        T_c_b @ moved.relative.T @ T_b_c,
+        T_c_b[:3, :3] @ moved.relative.velocity_m_s,
+        turn @ moved.relative.covariance @ turn.T,
+    )
+
+
+def _corrected(sample: TelemetrySample, shortfall_m_s: float) -> TelemetrySample:
+    """Correct a truncated velocity by the mean truncation loss."""
+    if shortfall_m_s == 0.0:
+        return sample
+    return replace(sample, velocity_m_s=sample.velocity_m_s + shortfall_m_s * np.sign(sample.velocity_m_s))

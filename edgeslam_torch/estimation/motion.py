@@ -1,0 +1,439 @@
+"""Fusion of map and telemetry: metric scale, gravity, video delay, and pose prediction without vision.
+
+`MotionFusion` receives frames and messages and delegates to its parts: `remembered` (messages, poses, delay, gates),
+`orientation` (map and camera in the drone's world), `scale_estimator` (the scale and its sources), `comparison`
+(validation of telemetry), `telemetry_scale`, `filter_feed` and `prediction`. Reading a result computes nothing: each
+tracked frame may trigger a fit, whose results are valid until the next.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.dead_reckoning import REACH_S as RECKONED_S
+from edgeslam_torch.estimation.dead_reckoning import Reckoned, reckoned
+from edgeslam_torch.estimation.displacement import TelemetryModel
+from edgeslam_torch.estimation.filter.filter_feed import FilterFeed, Metric
+from edgeslam_torch.estimation.health import disagreement
+from edgeslam_torch.estimation.orientation import Orientation
+from edgeslam_torch.estimation.output_frame import OutputFrame
+from edgeslam_torch.estimation.prediction import (
+    VISUAL_REACH_S,
+    PoseEstimate,
+    TelemetryPropagation,
+    between,
+    by_filter,
+    by_vision,
+    with_velocity,
+)
+from edgeslam_torch.estimation.remembered import Remembered
+from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
+from edgeslam_torch.estimation.snapshot import Present, Snapshot
+from edgeslam_torch.estimation.telemetry.comparison import Comparison, FlightSoFar
+from edgeslam_torch.estimation.telemetry.delay import DelaySearch
+from edgeslam_torch.estimation.telemetry.local_scale import drift_in_words, scale_around, scale_of
+from edgeslam_torch.estimation.telemetry.scale_change import REACH_S, grown
+from edgeslam_torch.estimation.telemetry.scale_convergence import ScaleConvergence
+from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, SensorGate
+from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
+from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory, VisualPose
+from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
+from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
+
+_REFIT_S = 1.0
+_FIRST_FIT_S = 0.5
+"""Time between fits as long as telemetry has given no scale or no delay: the length of a displacement."""
+_REFIT_SHARE = 0.12
+"""Time between fits as a share of the duration so far: later fits cost more and change less."""
+_USUAL_SIGMA = 0.01
+"""Standard deviation assumed for a visual pose from the log [map units, rad]."""
+
+
+class MotionFusion:
+    """Aligns the visual map with the drone's telemetry; `EdgeSlam` calls it for every frame and every packet.
+
+    The map may be in any fixed gauge: ``T_w_c`` in arbitrary units and axes.
+    A frame stamped ``t`` corresponds to telemetry at ``t - delay``.
+
+    Args:
+        config: Settings.
+        T_b_c: Camera in the body frame ``(4, 4)`` [m]; for a Tello tilted down by some 12 degrees.
+        focal_sigma: Relative standard deviation of the camera's focal length; a wrong one bends the map and its scale.
+    """
+
+    def __init__(self, config: FusionConfig, T_b_c: FloatArray, focal_sigma: float = 0.0) -> None:
+        self.config = config
+        given = np.asarray(T_b_c, dtype=np.float64)
+        self.refined_poses: Callable[[float], tuple[FloatArray, FloatArray]] | None = None
+        """Returns stamps and poses of the frames since a stamp, in the present map; called before each fit."""
+        self.flight = Remembered(
+            config,
+            TelemetryTrack(config.velocity_frame, config.max_gap_s),
+            VisualMemory(config.interval_s, config.window_s, config.max_gap_s),
+            DelaySearch(config, given[:3, :3]),
+            SensorGate(),
+        )
+        self.orientation = Orientation(self.flight, given)
+        self.metres = ScaleEstimator(config, focal_sigma)
+        self._comparison = Comparison(config)
+        self._filter = FilterFeed(config, given)
+        self._convergence = ScaleConvergence()
+        self._drift: str | None = None
+        """Warning that parts of the map have different scales."""
+        self._fitted_s = self._followed_s = -math.inf
+        """Stamps of the last fit, and of the last adaptation to the map between fits."""
+        self._counts: Counter[str] = Counter()
+
+    # --- input ---------------------------------------------------------------------------------------------------
+
+    def add_telemetry(self, samples: Sequence[TelemetrySample]) -> None:
+        """State messages in the order of arrival."""
+        for sample in self.flight.track.add(samples):
+            if np.isfinite(sample.rpy_rad).all():
+                self.orientation.note_attitude(sample.stamp_s)
+            self._filter.add_telemetry(sample, self.metres.fit.shortfall_m_s)
+
+    def add_visual(
+        self, stamp_s: float, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float, tracked: bool = True
+    ) -> None:
+        """Pose of one frame in the map; delay, alignment and scale are fitted again when enough time has passed.
+
+        Args:
+            stamp_s: Stamp of the frame.
+            T_w_c: Camera to map ``(4, 4)`` [map units].
+            sigma_t: Standard deviation of its translation per axis [map units].
+            sigma_r_rad: Standard deviation of its rotation per axis.
+            tracked: False when the pose does not rest on this frame's image (predicted, lost): it is no measurement.
+        """
+        if not tracked or not np.isfinite(T_w_c).all():
+            self._memory.interrupt()
+            self._counts["visual not tracked"] += 1
+            return
+        last = self._memory.last
+        if last is not None and stamp_s <= last.stamp_s:
+            self._counts["visual out of order"] += 1
+            return
+        visual = VisualPose(stamp_s, np.array(T_w_c, dtype=np.float64), sigma_t, sigma_r_rad)
+        self._memory.add(visual)
+        if self._is_due(stamp_s) or (stamp_s - self._fitted_s >= _FIRST_FIT_S and self.orientation.has_diverged()):
+            self._remember_refined(stamp_s, self.config.window_s)
+            self._refit()
+        elif self.metres.sensor_scale is not None and stamp_s - max(self._fitted_s, self._followed_s) >= _REFIT_S:
+            self._follow_map(stamp_s)
+        if self._trust.velocity and self._trust.motion:
+            self._filter.see(visual, Metric(self.scale(), self.flight.delay.delay))
+        else:
+            self._filter.clear()
+
+    def _follow_map(self, stamp_s: float) -> None:
+        """Adapt the scale to a map that refinement has scaled since the last fit."""
+        self._followed_s = stamp_s
+        before = self._memory.displacements()
+        self._remember_refined(stamp_s, REACH_S)
+        self.metres.follow(math.log(grown(before, self._memory.displacements(), stamp_s)))
+
+    def add_earlier(self, stamps_s: FloatArray, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
+        """Add the frames on which a new submap rests, from before its first tracked one.
+
+        Args:
+            stamps_s: Their stamps ``(F,)``, increasing.
+            T_w_c: Their poses ``(F, 4, 4)`` in the map.
+            sigma_t: As for `add_visual`.
+            sigma_r_rad: Likewise.
+        """
+        for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
+            last = self._memory.last
+            if np.isfinite(T).all() and (last is None or stamp_s > last.stamp_s):
+                self._memory.add(VisualPose(stamp_s, T, sigma_t, sigma_r_rad))
+
+    def revise(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
+        """Replace earlier poses by refined ones.
+
+        Args:
+            stamps_s: Stamps of frames ``(F,)``, as given to `add_visual`; others are ignored.
+            T_w_c: Their poses ``(F, 4, 4)`` in the present map.
+        """
+        self._remember(stamps_s, T_w_c)
+        self._refit(flying=False)
+
+    def _remember_refined(self, stamp_s: float, reach_s: float) -> None:
+        """Update the poses of the last seconds to the present map, and measure the change."""
+        if self.refined_poses is None:
+            return
+        before = self._memory.sightings()
+        self._remember(*self.refined_poses(stamp_s - reach_s))
+        self._convergence.compare(before, self._memory.sightings(), stamp_s)
+
+    def _remember(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
+        self._memory.revise(stamps_s, T_w_c)
+        if (seen := self._filter.seen) is not None:
+            self._filter.move_map(seen.revised(dict(zip(stamps_s.tolist(), T_w_c, strict=True))))
+
+    def map_moved(self, T: FloatArray) -> None:
+        """Apply a correction of the map around the newest frame, ``T_w_c' = T T_w_c`` with ``(4, 4)``."""
+        self._memory.move_newest(T)
+        if (seen := self._filter.seen) is not None:
+            self._filter.move_map(seen.moved(T))
+
+    def begin_piece(self) -> None:
+        """Begin a submap at a predicted pose: the step between submaps is no motion of the camera."""
+        self._filter.clear()
+        self._memory.interrupt()
+
+    # --- output --------------------------------------------------------------------------------------------------
+
+    @property
+    def delay_s(self) -> float:
+        """Video delay behind telemetry [s]: configured, estimated, or the default while unknown."""
+        return self.flight.delay_s
+
+    def scale(self) -> ScaleEstimate:
+        """Metres per map unit with sigma and source; unchanged without new measurements."""
+        return self.metres.scale()
+
+    def scale_around(self, stamp_s: float) -> ScaleEstimate | None:
+        """Metres per map unit within seconds of an earlier frame, in the present map; None without telemetry."""
+        R_w_m = self._compared_in()
+        if R_w_m is None:
+            return None
+        moved, low = self._memory.displacements(), self.metres.fit.shortfall_m_s
+        T_b_c = self.orientation.T_b_c
+        return scale_around(moved, self._track, stamp_s, self.delay_s, R_w_m, T_b_c, self.config, low)
+
+    def scale_along(self, stamps_s: FloatArray, T_w_c: FloatArray) -> ScaleEstimate | None:
+        """Metres per map unit along some frames of the flight, ``(F,)`` and ``(F, 4, 4)``; None without telemetry."""
+        R_w_m = self._compared_in()
+        if R_w_m is None or len(stamps_s) == 0:
+            return None
+        length_s = float(stamps_s[-1] - stamps_s[0]) + self.config.window_s
+        memory = VisualMemory(self.config.interval_s, length_s, self.config.max_gap_s)
+        for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
+            memory.add(VisualPose(stamp_s, T, _USUAL_SIGMA, _USUAL_SIGMA))
+        low, T_b_c = self.metres.fit.shortfall_m_s, self.orientation.T_b_c
+        return scale_of(memory.displacements(), self._track, self.delay_s, R_w_m, T_b_c, self.config, low)
+
+    def _compared_in(self) -> FloatArray | None:
+        """``R_w_m`` if velocities may determine a scale."""
+        return self.orientation.R_w_m if self._trust.velocity and len(self._track) > 0 else None
+
+    def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
+        """As `Orientation.vertical`; None if the map did not begin upright, or has a metric scale: attitude in whole
+        degrees is worse than a map with parallax."""
+        asked = self.metres.sensor_scale is None and self.orientation.began_upright
+        return self.orientation.vertical(stamp_s) if asked else None
+
+    def attitude_and_position(self, stamp_s: float) -> tuple[tuple[FloatArray, float] | None, Reckoned | None]:
+        """Results of `Orientation.turned` and `reckoned` for a frame."""
+        return self.orientation.turned(stamp_s), self.reckoned(stamp_s)
+
+    def reckoned(self, stamp_s: float) -> Reckoned | None:
+        """Position of a frame's camera by dead reckoning; None without validated velocities or without a metric scale
+        that rests on them: heights alone may give a scale that is wrong by several times."""
+        scale = self.metres.sensor_scale
+        if scale is None or "telemetry" not in scale.source:
+            return None
+        model, recent = self._model(), self._memory.recent(stamp_s - RECKONED_S)
+        if model is None or recent is None or not (model.velocity and math.isfinite(model.delay_sigma_s)):
+            return None
+        return reckoned(model, recent, stamp_s)
+
+    @property
+    def filtering(self) -> bool:
+        """Whether the Kalman filter receives visual updates and predicts the camera."""
+        return self._filter.seen is not None
+
+    def predict(self, stamp_s: float) -> PoseEstimate | None:
+        """Camera pose at a frame's stamp from the last visual poses and later telemetry.
+
+        Returns:
+            The estimate in map units, or ``None`` before the first tracked frame.
+        """
+        last, previous = self._memory.last, self._memory.previous
+        if last is None:
+            return None
+        view = self._filter.view(stamp_s) if stamp_s > last.stamp_s else None
+        if view is not None:
+            predicted = by_filter(view, self.scale(), self.flight.delay_sigma_s)
+            return with_velocity(predicted, last, previous, self.scale())
+        return self._predict_unfiltered(last, previous, stamp_s)
+
+    def republished(self, published: OutputFrame, centre_map: FloatArray, keep_scale: bool) -> OutputFrame:
+        """The published frame, levelled and, unless ``keep_scale``, with the present scale or guess; the
+        published position of ``centre_map`` ``(3,)`` stays."""
+        published = published.turned_upright(self.orientation.upright(), centre_map)
+        if keep_scale:
+            return published
+        return published.guessed_anew(self.metres.guess, centre_map).revised(self.scale(), centre_map)
+
+    def present(
+        self, stamp_s: float, state: str, published: OutputFrame, submap_sigma: float = 0.0, drift_sigma: float = 0.0
+    ) -> Present:
+        """State after a frame: the motion, and the reliability of its scale.
+
+        Args:
+            stamp_s: Stamp of the frame.
+            state: State of the machine.
+            published: Published frame of the map.
+            submap_sigma: As in `Health`.
+            drift_sigma: As in `Health`.
+        """
+        known = self.health(stamp_s, state, published.is_metric(self.scale()))
+        health = replace(known, submap_sigma=submap_sigma, drift_sigma=drift_sigma)
+        return Present(self.snapshot(), published, health.metric, health)
+
+    def health(self, stamp_s: float, state: str, metric: bool) -> Health:
+        """Reliability of the scale; arguments as in `present`, and whether the published unit is a metre."""
+        sources, delay, scale = self.metres.sources(), self.flight.delay.delay, self.scale()
+        doubt = self.metres.contradiction()
+        return Health(
+            stamp_s,
+            state,
+            metric,
+            scale,
+            sources,
+            disagreement(sources),
+            stamp_s - self._track.last_s,
+            delay.value_s if math.isfinite(delay.sigma_s) else math.nan,
+            delay.sigma_s,
+            self._track.battery,
+            self.filtering,
+            tuple(self._trust.warnings() + [said for said in (doubt, self._drift) if said is not None]),
+        )
+
+    def snapshot(self) -> Snapshot | None:
+        """Present motion, for other threads; ``None`` before the first tracked frame."""
+        last = self._memory.last
+        if last is None:
+            return None
+        return Snapshot(last, self._memory.previous, self._filter.frozen(), self.scale(), self.flight.delay_sigma_s)
+
+    def _predict_unfiltered(self, last: VisualPose, previous: VisualPose | None, stamp_s: float) -> PoseEstimate:
+        """Prediction while the filter has no scale or delay, telemetry has a gap, or contradicts the images."""
+        gap = stamp_s - last.stamp_s
+        visual = by_vision(last, previous, stamp_s)
+        share = 1.0 if previous is None else float(np.clip((gap - VISUAL_REACH_S) / VISUAL_REACH_S, 0.0, 1.0))
+        if share == 0.0 or gap <= 0.0 or not self._trust.motion:
+            return visual
+        propagated = self._propagation().on(last, stamp_s)
+        return visual if propagated is None else between(visual, propagated, share)
+
+    def _propagation(self) -> TelemetryPropagation:
+        sigma = self.config.sigma_velocity_m_s
+        T_b_c, R_w_m = self.orientation.T_b_c, self.orientation.R_w_m
+        delay_s, doubt_s = self.delay_s, self.flight.delay_sigma_s
+        return TelemetryPropagation(self._track, delay_s, doubt_s, T_b_c, R_w_m, self.scale(), self.metres.fit, sigma)
+
+    def statistics(self) -> dict[str, float]:
+        """Counters and the state of the estimates, for the report."""
+        numbers: dict[str, float] = dict(self._counts)
+        numbers.update({f"ekf {k}": v for k, v in self._filter.ekf.statistics().items()})
+        numbers["telemetry samples"] = len(self._track)
+        numbers["telemetry refused"] = self._track.refused
+        numbers["displacements"] = self._memory.count
+        numbers["video delay s"] = self.delay_s
+        numbers["video delay sigma s"] = self.flight.delay_sigma_s
+        numbers.update({f"agreement {reading}": found.share for reading, found in self._trust.latest.items()})
+        numbers["camera mount turned deg"] = math.degrees(self.orientation.mount_turned_rad)
+        return numbers | self.metres.statistics()
+
+    def warnings(self) -> list[str]:
+        """Warnings of a rejected depth network or rejected telemetry."""
+        drift = [] if self._drift is None else [self._drift]
+        return self._trust.warnings() + self._track.warnings() + self.metres.warnings() + drift
+
+    def telemetry(self) -> TelemetryModel | None:
+        """Present telemetry and its alignment with the map, for refinement; None without any.
+
+        Before the metric scale is known only gravity is used, and only if the map began upright: `Orientation.R_w_m` is
+        a mean over attitudes and would include the map's own tilt.
+        """
+        model = self._model()
+        return None if model is None else replace(model, track=self._track.copy())
+
+    def _model(self) -> TelemetryModel | None:
+        """The same without a copy of the track, for immediate use."""
+        scale, orientation = self.metres.sensor_scale, self.orientation
+        R_w_m = orientation.R_w_m if scale is not None else np.eye(3) if orientation.began_upright else None
+        if R_w_m is None:
+            return None
+        there = self._track.heights()
+        heights = [reading for reading in HEIGHTS if reading in there and self._trust.height(reading)]
+        odds = self._trust.at_odds  # sources that are not used for the scale must not constrain the map either
+        return TelemetryModel(
+            self._track,
+            self.config,
+            orientation.given if scale is None else orientation.T_b_c,
+            R_w_m,
+            self.delay_s,
+            self.flight.delay_sigma_s,
+            1.0 if scale is None else math.exp(scale.log_scale),
+            math.inf if scale is None else scale.sigma,
+            self.metres.velocity_constrains_map(self._trust),
+            heights[0] if scale is not None and heights and (odds is None or odds.kept == "height") else None,
+            self.metres.fit.truncates,
+            self._trust.attitude,
+            standing=scale is not None and self.metres.velocity_is_right(self._trust),
+        )
+
+    # --- estimation ----------------------------------------------------------------------------------------------
+
+    @property
+    def _track(self) -> TelemetryTrack:
+        return self.flight.track
+
+    @property
+    def _memory(self) -> VisualMemory:
+        return self.flight.memory
+
+    @property
+    def _trust(self) -> SensorGate:
+        return self.flight.trust
+
+    def _is_due(self, stamp_s: float) -> bool:
+        known = self.metres.sensor_scale is not None and math.isfinite(self.flight.delay_sigma_s)
+        first_s = _REFIT_S if known else _FIRST_FIT_S
+        pause_s = max(first_s, _REFIT_SHARE * min(self._memory.length_s, self.config.window_s))
+        return len(self._track) > 0 and (self.orientation.found is None or stamp_s - self._fitted_s >= pause_s)
+
+    def _refit(self, flying: bool = True) -> None:
+        """Fit delay, alignment, gates and scale."""
+        last, orientation, metres = self._memory.last, self.orientation, self.metres
+        if last is None or len(self._track) == 0:
+            return
+        self._fitted_s = last.stamp_s
+        if orientation.found is None:
+            orientation.found = orientation.fitted()
+        self._search_delay()
+        turned = orientation.fitted()
+        if turned is None:
+            return
+        orientation.found = turned
+        network, wander_log = metres.network(), metres.network_wander_log()
+        present = FlightSoFar(self._memory, self._track, turned.R_b_c, metres.rough(), network, wander_log)
+        self._comparison.judge(self._trust, present, self.flight.delay.delay, turned.R_w_m, flying)
+        self._trust.at_odds = None
+        convergence_sigma = self._convergence.sigma if flying else 0.0
+        previous_scale = metres.previous_scale()
+
+        def scale(trust: SensorGate) -> TelemetryScale:
+            T_b_c = orientation.T_b_c
+            return TelemetryScale(self.config, T_b_c, present, trust, self.delay_s, turned, previous_scale, flying)
+
+        metres.take(scale(self._trust).opinion(), convergence_sigma, self._trust)
+        guesses = flying and metres.sensor_scale is None
+        metres.provisional_scale(
+            scale(self._trust.supposing_heights()).opinion() if guesses else None, convergence_sigma
+        )
+        oldest = self._memory.sightings().stamps_s[0]
+        self._drift = drift_in_words(self.scale_around, float(oldest), last.stamp_s)
+
+    def _search_delay(self) -> None:
+        guessed = not math.isfinite(self.flight.delay_sigma_s)
+        self.flight.delay.search(self._memory, self._track)
+        if guessed and math.isfinite(self.flight.delay_sigma_s):  # heights were compared with a wrong delay
+            for reading in HEIGHTS:
+                self._trust.forget(reading)

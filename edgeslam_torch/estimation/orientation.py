@@ -1,0 +1,149 @@
+"""Orientation of the map, and of the camera on the drone, from the drone's attitude."""
+
+import math
+
+import numpy as np
+
+from edgeslam_torch.estimation.displacement import DELAY_S, is_steady
+from edgeslam_torch.estimation.remembered import Remembered
+from edgeslam_torch.estimation.scale.camera_mount import Turned, mount_by_turns
+from edgeslam_torch.estimation.telemetry.alignment import LATELY, attitudes, map_to_world
+from edgeslam_torch.estimation.telemetry.comparison import MOST_APART_RAD
+from edgeslam_torch.estimation.telemetry.visual_memory import Sightings
+from edgeslam_torch.geometry.rotations import mean_rotation, rotation_vector, turn_left
+from edgeslam_torch.types import FloatArray
+
+_TURNED_S = 5.0
+"""Time over which map and attitude are aligned; maps drift by a degree in it."""
+_AT_ONCE_S = 0.5
+"""Time after the first frame in which the first attitude must arrive to level the map: five messages."""
+_STAMPED_S = 0.05
+"""Standard deviation of a message's stamp: half the message interval."""
+_LEAST_FACING = 30
+"""Minimum number of frames for the heading of a submap: one or two seconds."""
+
+
+class Orientation:
+    """Rotations of one flight's map.
+
+    Args:
+        flight: Messages and poses so far.
+        given: Configured pose of the camera in the body ``(4, 4)`` [m].
+    """
+
+    def __init__(self, flight: Remembered, given: FloatArray) -> None:
+        self._flight, self.given = flight, given
+        self.found: Turned | None = None
+        """Result of the newest fit; None without telemetry attitude."""
+        self.began_s = math.nan
+        """Stamp of the first frame."""
+        self.began_upright = False
+        """Whether the map's z axis is up: its first pose was set by the drone's attitude."""
+        self._attitude_s = math.inf
+
+    @property
+    def R_w_m(self) -> FloatArray | None:
+        """``(3, 3)`` map axes to the drone's power-on world; None without telemetry attitude."""
+        return None if self.found is None else self.found.R_w_m
+
+    @property
+    def T_b_c(self) -> FloatArray:
+        """Camera in the body ``(4, 4)`` [m] as estimated, consistent with `R_w_m`."""
+        if self.found is None:
+            return self.given
+        T_b_c = self.given.copy()
+        T_b_c[:3, :3] = self.found.R_b_c
+        return T_b_c
+
+    @property
+    def mount_turned_rad(self) -> float:
+        """Angle between the estimated and the configured mount."""
+        return float(np.linalg.norm(rotation_vector(self.T_b_c[:3, :3] @ self.given[:3, :3].T)))
+
+    def note_attitude(self, stamp_s: float) -> None:
+        """Record a message with attitude."""
+        self._attitude_s = min(self._attitude_s, stamp_s)
+
+    def fitted(self) -> Turned | None:
+        """Fit to all stored poses; the mount is estimated only after the attitude was validated by images."""
+        flight = self._flight
+        pairs = attitudes(flight.memory.sightings(), flight.track, flight.delay_s)
+        if pairs is None:
+            return None
+        R_b_c, sigma_rad = self.given[:3, :3], flight.config.alignment_sigma_rad
+        if flight.trust.turns:
+            return mount_by_turns(pairs.R_m_c, pairs.R_w_b, pairs.stamp_s, R_b_c, sigma_rad)
+        return Turned(R_b_c, pairs.map_to_world(R_b_c), np.full(3, sigma_rad))
+
+    def has_diverged(self) -> bool:
+        """Whether a validated attitude has begun to disagree with the images."""
+        flight, found = self._flight, self.found
+        asked = found is not None and flight.trust.turns and math.isfinite(flight.delay_sigma_s)
+        pairs = attitudes(flight.memory.newest(LATELY), flight.track, flight.delay_s) if asked else None
+        if pairs is None or found is None:
+            return False
+        return float(np.linalg.norm(rotation_vector(pairs.map_to_world(found.R_b_c) @ found.R_w_m.T))) > MOST_APART_RAD
+
+    def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
+        """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and its maximum error [rad] due to the
+        uncertain delay; None without usable attitude. For a map that `began_upright`."""
+        flight = self._flight
+        at_s = np.array([stamp_s - flight.delay_s])
+        if not (flight.trust.attitude and flight.track.covered(at_s, at_s)[0]):
+            return None
+        if not (flight.trust.turns or is_steady(flight.track, at_s)[0]):
+            return None
+        leaned = flight.track.leaned(at_s, min(flight.delay_sigma_s, DELAY_S))
+        return self.given[:3, :3].T @ flight.track.attitude(at_s)[0, 2], float(leaned[0])
+
+    def turned(self, stamp_s: float) -> tuple[FloatArray, float] | None:
+        """Rotation ``R_c_m`` ``(3, 3)`` of a frame's camera by the drone's attitude, aligned with the map over the last
+        seconds, and its maximum error [rad] due to the uncertain delay; None without validated telemetry or enough
+        frames."""
+        flight = self._flight
+        late_s = math.hypot(flight.delay_sigma_s, _STAMPED_S)
+        around = stamp_s - flight.delay_s + np.array([0.0, -late_s, late_s])
+        if not (flight.trust.turns and math.isfinite(late_s) and flight.track.covered(around[:1], around[:1])[0]):
+            return None
+        recent = flight.memory.recent(stamp_s - _TURNED_S)
+        if recent is None:
+            return None
+        R_b_c = self.T_b_c[:3, :3]
+        R_w_m = map_to_world(recent, flight.track, flight.delay_s, R_b_c)
+        if R_w_m is None:
+            return None
+        R_m_c = R_w_m.T @ flight.track.attitude(around) @ R_b_c
+        doubt = max(float(np.linalg.norm(rotation_vector(R_m_c[0].T @ R_m_c[k]))) for k in (1, 2))
+        return R_m_c[0].T, doubt
+
+    def facing_along(self, stamps_s: FloatArray, T_w_c: FloatArray) -> tuple[FloatArray, float] | None:
+        """``R_w_m`` ``(3, 3)`` of some frames, ``(F,)`` and ``(F, 4, 4)``, and the standard deviation of its heading
+        [rad]: scatter, and the error of the mount. None without validated telemetry for enough of them."""
+        flight = self._flight
+        if not (flight.trust.turns and math.isfinite(flight.delay_sigma_s)):
+            return None
+        shown = Sightings(stamps_s, T_w_c, np.zeros(len(stamps_s)))
+        pairs = attitudes(shown, flight.track, flight.delay_s)
+        if pairs is None or len(pairs.stamp_s) < _LEAST_FACING:
+            return None
+        each = pairs.R_w_b @ self.T_b_c[:3, :3] @ np.swapaxes(pairs.R_m_c, 1, 2)
+        R_w_m = mean_rotation(each)
+        angle = turn_left(each @ R_w_m.T)
+        return R_w_m, math.hypot(flight.config.alignment_sigma_rad, float(np.sqrt(np.mean(angle**2))))
+
+    def upright(self) -> FloatArray | None:
+        """``R_w_m`` if attitude may level the world: when it was validated, or arrived with the first frame."""
+        if self.found is None or not self._flight.trust.attitude:
+            return None
+        at_once = self._attitude_s - self.began_s < _AT_ONCE_S
+        return self.found.R_w_m if at_once or self._flight.trust.turns else None
+
+    def leaning(self) -> str | None:
+        """Warning that no usable attitude levelled the world; None if the drone sent none."""
+        if not math.isfinite(self._attitude_s):
+            return None
+        return (
+            "the direction of gravity is unknown, the world leans as the first camera did: no attitude of the drone "
+            "that arrived at once or was validated covers a frame with a pose (the first one came "
+            f"{self._attitude_s - self.began_s:.1f} s after the first frame)"
+        )

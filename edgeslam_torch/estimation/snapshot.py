@@ -1,0 +1,106 @@
+"""Current camera pose from immutable records, safe to use in other threads."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from edgeslam_torch.estimation.filter.filter_feed import FilterView, FrozenFilter
+from edgeslam_torch.estimation.output_frame import OutputFrame
+from edgeslam_torch.estimation.prediction import by_vision
+from edgeslam_torch.estimation.telemetry.visual_memory import VisualPose
+from edgeslam_torch.types import FloatArray, Health, PoseNow, ScaleEstimate, TelemetrySample
+
+_LONGEST_STEP_S = 0.5
+"""Maximum time between tracked frames for a velocity."""
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """State of the fusion at one time."""
+
+    last: VisualPose
+    """Newest tracked frame."""
+    previous: VisualPose | None
+    """The one before, if tracking was not interrupted since."""
+    filter: FrozenFilter | None
+    scale: ScaleEstimate
+    delay_sigma_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Present:
+    """State after a frame: the snapshot, the published world, and its reliability."""
+
+    snapshot: Snapshot | None = None
+    published: OutputFrame = field(default_factory=OutputFrame)
+    metric: bool = False
+    health: Health | None = None
+    """None before the first frame."""
+
+    def pose_at(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> PoseNow | None:
+        """Camera pose at a stamp; ``None`` before the first tracked frame.
+
+        Args:
+            stamp_s: No earlier than the newest state message.
+            telemetry: State messages that arrived since the snapshot.
+        """
+        known = self.snapshot
+        if known is None:
+            return None
+        view = known.filter.view(stamp_s, telemetry) if known.filter is not None else None
+        return self._by_vision(known, stamp_s) if view is None else self._by_filter(known, view)
+
+    def _by_filter(self, known: Snapshot, view: FilterView) -> PoseNow:
+        assert known.filter is not None
+        unit = self.published.scale / known.scale.value  # published units per metre
+        T_w_seen = self.published.pose(view.seen.T)
+        T_seen_c = view.T_seen_c.copy()
+        T_seen_c[:3, 3] *= unit
+        return PoseNow(
+            view.to_s - known.filter.delay.value_s,
+            T_w_seen @ T_seen_c,
+            unit * (T_w_seen[:3, :3] @ view.velocity_m_s),
+            _in_world(_with_doubts(view, known), T_w_seen[:3, :3], unit),
+            "filter",
+            view.seen.stamp_s,
+            self.metric,
+            self.published.revision,
+        )
+
+    def _by_vision(self, known: Snapshot, stamp_s: float) -> PoseNow:
+        """Constant velocity; without two frames the sigma of the velocity is infinite."""
+        last, previous = known.last, known.previous
+        seen = by_vision(last, previous, stamp_s)
+        velocity, sigma_v = np.zeros(3), math.inf
+        if previous is not None and last.stamp_s - previous.stamp_s < _LONGEST_STEP_S:
+            step_s = last.stamp_s - previous.stamp_s
+            velocity = (last.T[:3, 3] - previous.T[:3, 3]) / step_s
+            sigma_v = math.hypot(math.sqrt(2.0) * last.sigma_t / step_s, seen.sigma_t / max(step_s, 1e-3))
+        sigma = np.repeat([seen.sigma_t, seen.sigma_r_rad, sigma_v], 3)
+        unit = self.published.scale
+        return PoseNow(
+            stamp_s,
+            self.published.pose(seen.T_w_c),
+            unit * (self.published.R @ velocity),
+            np.diag((sigma * np.repeat([unit, 1.0, unit], 3)) ** 2),
+            "visual",
+            last.stamp_s,
+            self.metric,
+            self.published.revision,
+        )
+
+
+def _with_doubts(view: FilterView, known: Snapshot) -> FloatArray:
+    """The filter's covariance, with the uncertainty of delay and scale added."""
+    covariance = view.covariance.copy()
+    way = view.T_seen_c[:3, 3] * (known.scale.sigma / known.scale.value)
+    late = view.velocity_m_s * known.delay_sigma_s
+    covariance[:3, :3] += np.outer(way, way) + np.outer(late, late)
+    return covariance
+
+
+def _in_world(covariance: FloatArray, R: FloatArray, unit: float) -> FloatArray:
+    turn = np.kron(np.diag([unit, 1.0, unit]), R)
+    return turn @ covariance @ turn.T

@@ -1,0 +1,184 @@
+"""Comparison of velocities and attitude with the images, at the current delay and at others."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.scale.log_scale import LogScale
+from edgeslam_torch.estimation.telemetry.alignment import Attitudes, apart, attitudes, map_to_world, turns
+from edgeslam_torch.estimation.telemetry.delay import GROWTH, Delay
+from edgeslam_torch.estimation.telemetry.sensor_validation import (
+    ATTITUDE,
+    Agreement,
+    Reading,
+    Reread,
+    SensorGate,
+    Verdict,
+    agreement,
+    broken_columns,
+)
+from edgeslam_torch.estimation.telemetry.track import TelemetryTrack, Turn
+from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, VisualMemory
+from edgeslam_torch.types import FloatArray
+
+_WIDE_DELAYS_S = (-3.0, 3.0)
+_WIDE_STEP_S = 0.1
+"""Delays beyond the allowed range are tested if telemetry fits badly: a wrong clock is reported, not used."""
+_FIXED_REACH_S = 0.15
+"""Tolerance of a configured delay."""
+_FITS_WELL = 0.9
+_TO_LOOK_ELSEWHERE = 12
+"""Minimum number of moving intervals before other frames and delays are tested."""
+_MUCH_LIKELIER = 6.0
+"""Minimum log-likelihood ratio; half the intervals count as independent."""
+_LEAST_TURN_RAD_S = math.radians(2.0)
+"""Minimum rotation rate: whole degrees twice a second are noise below."""
+_FEW_ATTITUDES = 15
+"""Minimum number of frames for validating attitude: a second and a half."""
+_APART_SHARE, _APART_RAD, MOST_APART_RAD = 0.5, math.radians(2.0), math.radians(6.0)
+"""Maximum RMS deviation between attitude and images about an axis: a share of the rotation about it, within bounds.
+Correct attitude (whole degrees, mount off by 7 degrees) deviates by 0.3 to 1 degree; a frozen column by the whole
+rotation, a sign error by twice that."""
+_DELAY_STEP_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class FlightSoFar:
+    """Inputs of a comparison."""
+
+    memory: VisualMemory
+    track: TelemetryTrack
+    R_b_c: FloatArray
+    """Camera in the body ``(3, 3)``."""
+    rough_scale: float | None
+    """Metres per map unit, for what counts as motion."""
+    network: LogScale | None = None
+    """Scale by the depth network, which decides between contradictory velocities and heights."""
+    network_wander_log: float = 0.0
+    """Variation of the network's log scale between keyframes."""
+
+
+class Comparison:
+    """Updates `SensorGate` with verdicts on velocities and attitude; records when other delays were last tested."""
+
+    def __init__(self, config: FusionConfig) -> None:
+        self._config = config
+        self._looked_wide_at = 0
+
+    def judge(
+        self, trust: SensorGate, present: FlightSoFar, delay: Delay, R_w_m: FloatArray, flying: bool = False
+    ) -> None:
+        """Compare at the current delay, in other frames and, if the fit is poor, at other delays.
+
+        Velocities that fit significantly better in another frame are interpreted in that frame from now on, overriding
+        settings and reader. A good fit does not prove the frame: a camera that leans without turning correlates by 80
+        to 90 % with velocities in body axes. While ``flying`` the tests are repeated only as data grow.
+        """
+        attitude = self._attitude(present, delay)
+        if attitude is not None:
+            trust.judge(Reading.ATTITUDE, attitude)
+        now, n = self._velocity(present, delay.value_s, R_w_m), present.memory.count
+        grown = not flying or n >= GROWTH * self._looked_wide_at
+        look = now.count >= _TO_LOOK_ELSEWHERE and grown
+        if look:
+            self._looked_wide_at = n
+            turn = self._fits_turned(present, now, delay.value_s, R_w_m) if trust.attitude else None
+            if turn is not None:
+                trust.reread = Reread(turn, now)
+                present.track.read_as(turn)
+                now = self._velocity(present, delay.value_s, R_w_m)
+                trust.forget(Reading.VELOCITY)
+        if not math.isfinite(delay.sigma_s):  # at a wrong delay every column shows another motion
+            now = replace(now, broken=())
+        if now.correlation >= _FITS_WELL:
+            trust.elsewhere_s = None
+        elif look:
+            trust.elsewhere_s = self._fits_elsewhere(present, now, delay.value_s)
+        trust.judge(Reading.VELOCITY, now)
+
+    def _fits_turned(self, present: FlightSoFar, now: Agreement, delay_s: float, R_w_m: FloatArray) -> Turn | None:
+        """The velocity frame that fits significantly better than the current one, if any."""
+        best, best_turn = now, None
+        for turn in present.track.other_turns:
+            other = replace(present, track=present.track.as_if(turn))
+            found = self._velocity(other, delay_s, R_w_m)
+            if found.correlation > best.correlation:
+                best, best_turn = found, turn
+        return best_turn if _surely_better(best, now) else None
+
+    def _fits_elsewhere(self, present: FlightSoFar, now: Agreement, used_s: float) -> float | None:
+        """The best-fitting delay, if it is significantly better than the current one and not allowed."""
+        fixed = self._config.delay_s
+        low, high = self._config.delay_range_s if fixed is None else (fixed - _FIXED_REACH_S, fixed + _FIXED_REACH_S)
+        best, best_s = now, used_s
+        for delay_s in np.arange(_WIDE_DELAYS_S[0], _WIDE_DELAYS_S[1] + 1e-9, _WIDE_STEP_S).tolist():
+            R = map_to_world(present.memory.sightings(), present.track, delay_s, present.R_b_c)
+            found = None if R is None else self._velocity(present, delay_s, R)
+            if found is not None and found.count >= now.count // 2 and found.correlation > best.correlation:
+                best, best_s = found, delay_s
+        return best_s if _surely_better(best, now) and not low <= best_s <= high else None
+
+    def _velocity(self, present: FlightSoFar, delay_s: float, R_w_m: FloatArray) -> Agreement:
+        """Agreement of velocities with the images at one delay.
+
+        The camera's lever arm is left out: rotations must not count as evidence for velocities.
+        """
+        track, moved = present.track, _in_common(present, delay_s)
+        if len(moved) == 0:
+            return Agreement()
+        duration = moved.duration_s[:, None]
+        told = track.displacement(moved.to_s - delay_s) - track.displacement(moved.from_s - delay_s)
+        slow = self._config.min_speed_m_s
+        least_seen = math.inf if present.rough_scale is None else 2.0 * slow / present.rough_scale
+        seen, told = moved.moved @ R_w_m.T / duration, told / duration
+        found = agreement(seen, told, least_seen, slow, early=True)
+        R_w = track.axes()[np.searchsorted(track.readings.stamp_s, 0.5 * (moved.from_s + moved.to_s) - delay_s)]
+        seen, told = (np.einsum("nwa,nw->na", R_w, v) for v in (seen, told))
+        return replace(found, broken=broken_columns(seen, told))
+
+    def _attitude(self, present: FlightSoFar, delay: Delay) -> Agreement | None:
+        """Agreement of attitude with the images; None without common intervals."""
+        moved = _in_common(present, delay.value_s)
+        if len(moved) == 0:
+            return None
+        both = turns(moved.on_telemetry_clock(delay.value_s), present.track, present.R_b_c)
+        seen, told = (Rotation.from_matrix(R).as_rotvec() / moved.duration_s[:, None] for R in (both.seen, both.told))
+        found = agreement(seen, told, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
+        return replace(found, broken=self._broken_attitude(present, delay))
+
+    def _broken_attitude(self, present: FlightSoFar, delay: Delay) -> tuple[str, ...]:
+        """Attitude columns that contradict the images at the known delay, or at all possible ones."""
+        known, sightings = math.isfinite(delay.sigma_s), present.memory.sightings()
+        low, high = self._config.delay_range_s
+        delays_s = [delay.value_s] if known else np.arange(low, high + 1e-9, _DELAY_STEP_S).tolist()
+        ratios = []
+        for delay_s in delays_s:
+            told = attitudes(sightings, present.track, delay_s)
+            if told is not None and len(told.stamp_s) >= _FEW_ATTITUDES:
+                ratios.append(self._parted(told, present.R_b_c, delay.sigma_s if known else _DELAY_STEP_S))
+        if not ratios:
+            return ()
+        best = min(ratios, key=max)
+        return tuple(name for name, ratio in zip(ATTITUDE, best.tolist(), strict=True) if ratio > 1.0)
+
+    def _parted(self, told: Attitudes, R_b_c: FloatArray, delay_sigma_s: float) -> FloatArray:
+        """Deviation about each axis relative to the allowed one ``(3,)``."""
+        found = apart(told, R_b_c, self._config.alignment_sigma_rad)
+        share = np.clip(_APART_SHARE * found.seen, _APART_RAD, MOST_APART_RAD)
+        late = delay_sigma_s * found.rate
+        return np.maximum(found.apart / np.hypot(share, late), found.lately / np.hypot(MOST_APART_RAD, 2.0 * late))
+
+
+def _in_common(present: FlightSoFar, delay_s: float) -> Displacements:
+    """Displacements that telemetry covers, on the video's clock."""
+    moved = present.memory.displacements()
+    return moved.only(present.track.covered(moved.from_s - delay_s, moved.to_s - delay_s))
+
+
+def _surely_better(best: Agreement, now: Agreement) -> bool:
+    """Whether one interpretation of the same telemetry is validated and significantly more likely."""
+    left, left_now = (1.0 - max(a.correlation, 0.0) ** 2 for a in (best, now))
+    return best.verdict is Verdict.AGREES and 0.25 * now.count * math.log(left_now / max(left, 1e-6)) > _MUCH_LIKELIER

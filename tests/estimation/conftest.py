@@ -1,0 +1,111 @@
+"""Recorded motion with simulated telemetry, and a camera whose map has its own gauge."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from edgeslam_torch.estimation.motion import MotionFusion
+from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.types import FloatArray, TelemetrySample
+
+T_B_C = camera_on_body()
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Camera poses at frame rate."""
+
+    stamps_s: FloatArray
+    T_w_c: FloatArray
+
+    def in_gauge(self, rng: np.random.Generator, noise_m: float = 0.003, noise_rad: float = 0.002) -> "Gauge":
+        """The same poses as a monocular map has them: turned, shifted, scaled, noisy."""
+        n = len(self.stamps_s)
+        T = self.T_w_c.copy()
+        T[:, :3, 3] += rng.normal(0, noise_m, (n, 3))
+        T[:, :3, :3] = T[:, :3, :3] @ Rotation.from_rotvec(rng.normal(0, noise_rad, (n, 3))).as_matrix()
+        T_m_w = np.eye(4)
+        T_m_w[:3, :3] = Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix()
+        T_m_w[:3, 3] = rng.normal(size=3)
+        T = T_m_w @ T
+        scale = float(np.exp(rng.uniform(-1, 1)))
+        T[:, :3, 3] /= scale
+        return Gauge(T, T_m_w, scale, noise_m / scale, noise_rad)
+
+
+@dataclass(frozen=True)
+class Gauge:
+    T_m_c: FloatArray
+    T_m_w: FloatArray
+    scale: float
+    """Metres per map unit."""
+    sigma_t: float
+    sigma_r: float
+
+
+def _swinging(duration_s: float = 20.0, rate_hz: float = 20.0, size_m: float = 0.25) -> Motion:
+    """A camera swung by hand along three axes, turning a little."""
+    t = np.arange(0.0, duration_s, 1.0 / rate_hz)
+    p = size_m * np.stack([np.sin(1.7 * t), np.sin(1.3 * t + 1.0), 0.7 * np.sin(2.1 * t + 2.0)], axis=1)
+    yaw, pitch = 0.3 * np.sin(0.7 * t), 0.08 * np.sin(1.1 * t)
+    T_w_b = np.tile(np.eye(4), (len(t), 1, 1))
+    T_w_b[:, :3, :3] = Rotation.from_euler("ZYX", np.stack([yaw, pitch, 0.0 * t], axis=1)).as_matrix()
+    T_w_b[:, :3, 3] = p + [0.0, 0.0, 1.2]
+    return Motion(t, T_w_b @ T_B_C)
+
+
+def _recorded(path: Path, rate_hz: float = 30.0) -> Motion:
+    """A ground-truth file in TUM format at frame rate."""
+    table = np.loadtxt(path)
+    table = table[np.unique(table[:, 0], return_index=True)[1]]
+    stamps = table[:, 0] - table[0, 0]
+    t = np.arange(0.0, stamps[-1], 1.0 / rate_hz)
+    T = np.tile(np.eye(4), (len(t), 1, 1))
+    T[:, :3, :3] = Slerp(stamps, Rotation.from_quat(table[:, 4:8]))(t).as_matrix()
+    T[:, :3, 3] = CubicSpline(stamps, table[:, 1:4])(t)
+    return Motion(t, T)
+
+
+def _replay(
+    fusion: MotionFusion,
+    motion: Motion,
+    gauge: Gauge,
+    telemetry: Sequence[TelemetrySample],
+    tracked: Callable[[float], bool] = lambda t: True,
+    each: Callable[[float, int], None] = lambda t, i: None,
+) -> None:
+    """Give frames and packets in the order of their stamps."""
+    sent = 0
+    for i, t in enumerate(motion.stamps_s):
+        end = sent
+        while end < len(telemetry) and telemetry[end].stamp_s <= t:
+            end += 1
+        fusion.add_telemetry(telemetry[sent:end])
+        sent = end
+        each(float(t), i)
+        fusion.add_visual(float(t), gauge.T_m_c[i], gauge.sigma_t, gauge.sigma_r, tracked(float(t)))
+        if i % 15 == 0:
+            fusion.scale()
+
+
+@pytest.fixture
+def swinging() -> Callable[..., Motion]:
+    """Function that gives a hand-swung camera: ``swinging(duration_s, rate_hz, size_m)``."""
+    return _swinging
+
+
+@pytest.fixture
+def recorded() -> Callable[[Path], Motion]:
+    """Function that reads a ground-truth file."""
+    return _recorded
+
+
+@pytest.fixture
+def replay() -> Callable[..., None]:
+    """Function that feeds a `MotionFusion` in the order of stamps."""
+    return _replay

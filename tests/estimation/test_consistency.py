@@ -1,0 +1,201 @@
+"""The filter on a real MAV's motion (EuRoC V1_01_easy): errors, and whether its covariance is true."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+from scipy.stats import chi2
+
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.filter.delayed import BufferedEkf, PoseSigma
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import matrix_from_rpy, rpy_from_matrix
+from edgeslam_torch.readers.telemetry_csv import read_telemetry
+from edgeslam_torch.types import FloatArray, TelemetrySample
+
+SIGMA_T, SIGMA_R = 0.005, np.deg2rad(0.1)
+"""Stated noise of one visual increment of 0.2 s."""
+VIDEO_DELAY_S = 0.5
+DURATION_S = 50.0
+
+
+@dataclass(frozen=True)
+class Flight:
+    stamps_s: FloatArray
+    p: FloatArray
+    R: Rotation
+
+    def pose(self, t):
+        T = np.tile(np.eye(4), (len(t), 1, 1))
+        T[:, :3, :3] = Slerp(self.stamps_s, self.R)(t).as_matrix()
+        T[:, :3, 3] = np.stack([np.interp(t, self.stamps_s, self.p[:, k]) for k in range(3)], axis=1)
+        return T
+
+
+@pytest.fixture(scope="module")
+def flight(data_dir: Path) -> Flight:
+    table = np.loadtxt(data_dir / "euroc_v1_01" / "groundtruth.txt")
+    table = table[np.unique(table[:, 0], return_index=True)[1]]
+    stamps = table[:, 0] - table[0, 0]
+    axes = Rotation.from_matrix(np.column_stack([[0, 0, 1.0], [0, -1.0, 0], [1.0, 0, 0]]))  # body axes in the IMU's
+    return Flight(stamps, table[:, 1:4], Rotation.from_quat(table[:, 4:8]) * axes)
+
+
+@dataclass(frozen=True)
+class Scene:
+    telemetry: list[TelemetrySample]
+    visual: list[tuple[float, float, FloatArray]]
+    stamps_s: FloatArray
+    T_w_b: FloatArray
+
+
+def scene(flight: Flight, seed: int) -> Scene:
+    """SDK telemetry (10 Hz, dm/s, degrees, bias that walks faster as the battery drains) and late visual increments."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(20.0, 20.0 + DURATION_S, 0.1) + rng.uniform(0, 0.02)
+    T = flight.pose(t)
+    T_p_w = np.eye(4)  # world to the power-on frame: level, heading and origin of the first pose
+    T_p_w[:3, :3] = matrix_from_rpy([0.0, 0.0, rpy_from_matrix(T[0, :3, :3])[2]]).T
+    T_p_w[:3, 3] = -T_p_w[:3, :3] @ T[0, :3, 3]
+    T = T_p_w @ T
+    rpy = np.array([rpy_from_matrix(m[:3, :3]) for m in T])
+    velocity = (flight.pose(t + 0.04)[:, :3, 3] - flight.pose(t - 0.04)[:, :3, 3]) / 0.08 @ T_p_w[:3, :3].T
+    battery = np.round(1.0 - 0.6 * (t - t[0]) / DURATION_S, 2)
+    walk = rng.standard_normal((len(t), 3)) * (0.005 * np.sqrt(0.1 * (2.0 - battery)))[:, None]
+    bias = rng.normal(0, 0.03, 3) + np.cumsum(walk, axis=0)
+    told = np.round(10 * (velocity + bias + rng.normal(0, 0.01, velocity.shape))) / 10
+    angles = np.deg2rad(np.round(np.rad2deg(rpy) + rng.normal(0, 0.2, rpy.shape)))
+    samples = [TelemetrySample(float(t[k]), told[k], angles[k], battery=float(battery[k])) for k in range(len(t))]
+    seen = np.arange(t[0] + 0.033, t[-1] - 0.1, 0.2)
+    T_seen = T_p_w @ flight.pose(seen)
+    visual = []
+    for i in range(1, len(seen)):
+        step = se3.inverse(T_seen[i - 1]) @ T_seen[i]
+        noisy = se3.exp(np.r_[0, 0, 0, rng.normal(0, SIGMA_R, 3)]) @ step
+        noisy[:3, 3] = step[:3, 3] + rng.normal(0, SIGMA_T, 3)
+        visual.append((float(seen[i - 1]), float(seen[i]), noisy))
+    return Scene(samples, visual, t, T)
+
+
+@dataclass(frozen=True)
+class Score:
+    rmse_m: float
+    nees: float
+    nis: list[tuple[int, float]]
+
+
+def fly(s: Scene, config: FusionConfig, absolute: bool = False) -> Score:
+    ekf = BufferedEkf(config)
+    pose: FloatArray | None = None
+    errors, nees, fed = [], [], 0
+    for k, sample in enumerate(s.telemetry):
+        ekf.add_telemetry(sample)
+        while fed < len(s.visual) and s.visual[fed][1] + VIDEO_DELAY_S <= sample.stamp_s:
+            from_s, to_s, step = s.visual[fed]
+            if absolute:
+                if pose is None:
+                    start = ekf.state_at(from_s)
+                    pose = np.eye(4)
+                    pose[:3, :3], pose[:3, 3] = matrix_from_rpy(start.rpy_rad), start.p_w
+                pose = pose @ step
+                ekf.add_absolute(to_s, pose, PoseSigma(SIGMA_T, SIGMA_R))
+            else:
+                ekf.add_relative(from_s, to_s, step, PoseSigma(SIGMA_T, SIGMA_R))
+            fed += 1
+        if k % 10 == 9:
+            state = ekf.state_at(sample.stamp_s)
+            errors.append(state.p_w - s.T_w_b[k, :3, 3])
+            nees.append(state.nees(s.T_w_b[k, :3, 3], rpy_from_matrix(s.T_w_b[k, :3, :3])))
+    rmse = float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
+    return Score(rmse, float(np.mean(nees)), ekf.nis())
+
+
+def integrated(s: Scene) -> float:
+    """RMSE of telemetry alone."""
+    v = np.array([x.velocity_m_s for x in s.telemetry])
+    p = np.vstack([np.zeros(3), np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(s.stamps_s)[:, None], axis=0)])
+    return float(np.sqrt(np.mean(np.sum((p - s.T_w_b[:, :3, 3]) ** 2, axis=1))))
+
+
+def rms(values) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.fixture(scope="module")
+def scenes(flight: Flight) -> list[Scene]:
+    return [scene(flight, seed) for seed in range(4)]
+
+
+@pytest.fixture(scope="module")
+def by_default(scenes: list[Scene]) -> list[Score]:
+    return [fly(s, FusionConfig()) for s in scenes]
+
+
+@pytest.mark.data
+def test_filter_beats_telemetry_alone_and_the_literal_filter(scenes, by_default):
+    default = rms([score.rmse_m for score in by_default])
+    literal = rms([fly(s, FusionConfig(literal=True), absolute=True).rmse_m for s in scenes])
+    body = rms([fly(s, FusionConfig(literal=True, velocity_frame="body"), absolute=True).rmse_m for s in scenes])
+    alone = rms([integrated(s) for s in scenes])
+    print(f"RMSE [m]: default {default:.3f}, literal {literal:.3f}, literal as printed {body:.3f}, alone {alone:.3f}")
+    assert default < alone / 3
+    assert default < literal < body
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_mean_nees_over_50_seeds_is_inside_its_95_percent_band(flight):
+    """Chi-square of 6 x 50 degrees over 50: 5.08 to 6.98."""
+    scenes = [scene(flight, seed) for seed in range(50)]
+    scores = [fly(s, FusionConfig()) for s in scenes]
+    nees = float(np.mean([s.nees for s in scores]))
+    low, high = chi2.ppf([0.025, 0.975], 300) / 50
+    nis = {n: float(np.mean([v for s in scores for k, v in s.nis if k == n])) for n in (3, 6)}
+    print(f"mean NEES {nees:.2f} in [{low:.2f}, {high:.2f}], NIS attitude {nis[3]:.2f} of 3, vision {nis[6]:.2f} of 6")
+    assert low <= nees <= high
+    assert rms([s.rmse_m for s in scores]) < rms([integrated(s) for s in scenes]) / 3
+    # Turning is process noise that the readings themselves announce, so innovations are smaller than stated:
+    # conservative, never overconfident.
+    assert nis[3] < 3.5
+    assert nis[6] < 6.5
+
+
+@pytest.mark.data
+def test_absolute_updates_of_accumulated_poses_are_overconfident_relative_ones_are_not(scenes, by_default):
+    relative = np.mean([score.nees for score in by_default])
+    absolute = np.mean([fly(s, FusionConfig(), absolute=True).nees for s in scenes])
+    assert absolute > 4 * relative
+    assert 3.0 < relative < 9.0
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["flight_a", "flight_b"])
+def test_real_tello_flights_run_through_the_filter(data_dir, name):
+    samples = read_telemetry(data_dir / "tello_telemetry" / f"{name}.csv")[0]
+    ekf = BufferedEkf(FusionConfig())
+    for sample in samples[:1200]:
+        ekf.add_telemetry(replace(sample))
+    state = ekf.state_at(samples[1199].stamp_s)
+    counts = ekf.statistics()
+    assert np.isfinite(state.covariance).all()
+    assert counts["attitude accepted"] > 0.97 * 1200
+    assert counts.get("attitude refused", 0) + counts.get("attitude recovered", 0) < 0.03 * 1200
+
+
+@pytest.mark.data
+def test_height_from_vertical_velocity_agrees_with_the_range_sensor(data_dir):
+    """Where the floor is flat: one-second changes of tof against integrated vz, flight_a (it climbs and sinks)."""
+    samples = read_telemetry(data_dir / "tello_telemetry" / "flight_a.csv")[0]
+    t = np.array([s.stamp_s for s in samples])
+    vz = np.array([s.velocity_m_s[2] for s in samples])
+    tof = np.array([s.tof_m for s in samples])
+    z = np.concatenate([[0.0], np.cumsum(0.5 * (vz[1:] + vz[:-1]) * np.diff(t))])
+    i = np.arange(len(t) - 10)
+    dz, dtof = z[i + 10] - z[i], tof[i + 10] - tof[i]
+    moving = (np.abs(dz) > 0.1) & np.isfinite(dtof) & (np.abs(dtof) < 1.0)
+    assert moving.sum() > 20
+    assert np.corrcoef(dz[moving], dtof[moving])[0, 1] > 0.9
+    assert 0.8 < np.sum(dz[moving] * dtof[moving]) / np.sum(dz[moving] ** 2) < 1.3

@@ -1,0 +1,177 @@
+import numpy as np
+import pytest
+
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.filter.delayed import BufferedEkf, PoseSigma
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.types import TelemetrySample
+
+CONFIG = FusionConfig()
+
+
+def telemetry(rng, count=40):
+    return [
+        TelemetrySample(0.1 * k, np.array([0.5, 0.1 * np.sin(0.2 * k), 0.0]), rng.normal(0, 0.003, 3), battery=0.8)
+        for k in range(count)
+    ]
+
+
+def increments(rng, count=18):
+    out = []
+    for k in range(1, count):
+        T = np.eye(4)
+        T[:3, 3] = [0.1, 0.0, 0.0] + rng.normal(0, 0.003, 3)
+        out.append((0.2 * k - 0.17, 0.2 * k + 0.03, T))
+    return out
+
+
+def run(samples, visual, delay):
+    """Feed in order of arrival: telemetry at once, visual increments ``delay`` late."""
+    ekf = BufferedEkf(CONFIG)
+    arrivals = [(s.stamp_s, 0, s) for s in samples] + [(v[1] + delay, 1, v) for v in visual]
+    for _, kind, item in sorted(arrivals, key=lambda a: a[:2]):
+        if kind == 0:
+            ekf.add_telemetry(item)
+        else:
+            ekf.add_relative(item[0], item[1], item[2], PoseSigma(0.004, 0.003))
+    return ekf
+
+
+def test_late_measurements_end_where_punctual_ones_do(rng):
+    samples, visual = telemetry(rng), increments(rng)
+    late, later = run(samples, visual, 0.31), run(samples, visual, 0.9)
+    a, b = late.state_at(3.3), later.state_at(3.3)
+    np.testing.assert_allclose(a.p_w, b.p_w, atol=2e-4)
+    np.testing.assert_allclose(a.covariance, b.covariance, rtol=0.02, atol=1e-7)
+
+
+def test_any_order_inside_the_buffer_gives_the_same_state(rng):
+    samples, visual = telemetry(rng, 20), increments(rng, 8)
+    ordered = BufferedEkf(CONFIG)
+    shuffled = BufferedEkf(CONFIG)
+    for s in samples:
+        ordered.add_telemetry(s)
+    for k in [0, 19, *rng.permutation(np.arange(1, 19))]:
+        shuffled.add_telemetry(samples[k])
+    for ekf in (ordered, shuffled):
+        for v in visual:
+            ekf.add_relative(*v, PoseSigma(0.004, 0.003))
+    np.testing.assert_allclose(ordered.state_at(1.9).p_w, shuffled.state_at(1.9).p_w, atol=1e-12)
+
+
+def test_too_late_is_refused_and_counted(rng):
+    ekf = run(telemetry(rng, 60), [], 0.0)
+    ekf.add_telemetry(TelemetrySample(0.05, np.zeros(3), np.zeros(3)))
+    assert ekf.statistics()["too late"] == 1
+
+
+def test_counts_say_what_was_accepted_and_refused(rng):
+    ekf = run(telemetry(rng), increments(rng), 0.5)
+    counts = ekf.statistics()
+    assert counts["attitude accepted"] > 35
+    assert counts["visual accepted"] >= 16
+    wild = np.eye(4)
+    wild[:3, 3] = [3.0, 0.0, 0.0]
+    ekf.add_relative(3.43, 3.63, wild, PoseSigma(0.004, 0.003))
+    assert ekf.statistics()["visual refused"] == counts.get("visual refused", 0) + 1
+
+
+def test_vision_that_disagrees_for_long_is_believed_in_the_end(rng):
+    ekf = BufferedEkf(CONFIG)
+    T = np.eye(4)
+    T[:3, 3] = [0.2, 0.0, 0.0]
+    for k in range(40):
+        ekf.add_telemetry(TelemetrySample(0.1 * k, np.zeros(3), np.zeros(3), battery=1.0))
+        if k >= 20:
+            ekf.add_relative(0.1 * (k - 1), 0.1 * k, T, PoseSigma(0.004, 0.003))
+    counts = ekf.statistics()
+    assert counts["visual refused"] >= CONFIG.refusals_before_recovery - 1
+    assert counts["visual recovered"] >= 1
+    assert ekf.state_at(3.9).p_w[0] > 1.0
+
+
+def test_bias_of_the_velocity_is_found_from_relative_poses(rng):
+    ekf = BufferedEkf(FusionConfig(sigma_bias_m_s=0.1))
+    T = np.eye(4)
+    T[:3, 3] = [0.03, 0.0, 0.0]  # 0.3 m/s, while telemetry says 0.38
+    for k in range(200):
+        ekf.add_telemetry(TelemetrySample(0.1 * k, np.array([0.38, 0.0, 0.0]), np.zeros(3), battery=1.0))
+        if k > 0:
+            ekf.add_relative(0.1 * (k - 1), 0.1 * k, T, PoseSigma(0.003, 0.003))
+    assert ekf.state_at(19.9).velocity_bias_m_s[0] == pytest.approx(0.08, abs=0.01)
+
+
+def test_a_drone_that_hovers_unseen_stays_where_it_was():
+    """What was cut off its speed is no speed: after 20 s at .45 m/s, told as .4, it reads that it stands for 10 s."""
+    ekf = BufferedEkf(CONFIG)
+    T = np.eye(4)
+    T[:3, 3] = [0.045, 0.0, 0.0]
+    for k in range(200):
+        ekf.add_telemetry(TelemetrySample(0.1 * k, np.array([0.4, 0.0, 0.0]), np.zeros(3), battery=1.0))
+        if k > 0:
+            ekf.add_relative(0.1 * (k - 1), 0.1 * k, T, PoseSigma(0.003, 0.003))
+    assert ekf.state_at(19.9).velocity_bias_m_s[0] < -0.03
+    p_w = []
+    for k in range(200, 300):
+        ekf.add_telemetry(TelemetrySample(0.1 * k, np.zeros(3), np.zeros(3), battery=1.0))
+        p_w.append(ekf.state_at(0.1 * k).p_w[0])
+    assert abs(p_w[-1] - p_w[5]) < 0.02
+
+
+def test_the_speed_of_a_wrong_map_does_not_stay_when_it_is_lost():
+    """A map sinks at .7 m/s for 2 s while the drone flies level, told as .2 m/s ahead; then nothing is seen for 5 s."""
+    ekf = BufferedEkf(CONFIG)
+    T = np.eye(4)
+    T[:3, 3] = [0.02, 0.0, -0.07]
+    for k in range(70):
+        ekf.add_telemetry(TelemetrySample(0.1 * k, np.array([0.2, 0.0, 0.1]), np.zeros(3), battery=1.0))
+        if 0 < k <= 20:
+            ekf.add_relative(0.1 * (k - 1), 0.1 * k, T, PoseSigma(0.003, 0.003))
+            lost_w = ekf.state_at(0.1 * k).p_w
+    moved = ekf.state_at(6.9).p_w - lost_w
+    assert moved[0] == pytest.approx(0.98, abs=0.1)
+    assert moved[2] > -0.1, "the map sank by .7 m/s, and may not go on with it"
+    assert np.abs(ekf.state_at(6.9).velocity_bias_m_s).max() <= CONFIG.velocity_step_m_s
+
+
+def test_silence_of_telemetry_only_adds_uncertainty(rng):
+    ekf = run(telemetry(rng, 20), [], 0.0)
+    near, far = ekf.state_at(1.95), ekf.state_at(6.0)
+    assert far.covariance[0, 0] > near.covariance[0, 0]
+    assert np.isfinite(far.covariance).all()
+
+
+def test_missing_fields_are_left_out():
+    ekf = BufferedEkf(CONFIG)
+    ekf.add_telemetry(TelemetrySample(0.0, rpy_rad=np.array([0.0, 0.0, 0.5])))
+    ekf.add_telemetry(TelemetrySample(0.1, velocity_m_s=np.array([1.0, 0.0, 0.0])))
+    ekf.add_telemetry(TelemetrySample(0.2, velocity_m_s=np.array([1.0, 0.0, 0.0])))
+    ekf.add_telemetry(TelemetrySample(np.nan))
+    state = ekf.state_at(0.2)
+    assert state.p_w[0] == pytest.approx(0.15, abs=1e-6)
+    assert state.rpy_rad[2] == pytest.approx(0.5, abs=1e-6)
+
+
+def test_increments_with_a_hole_start_from_a_fresh_clone(rng):
+    ekf = run(telemetry(rng, 30), [], 0.0)
+    T = np.eye(4)
+    T[:3, 3] = [0.1, 0.0, 0.0]
+    ekf.add_relative(0.5, 0.7, T, PoseSigma(0.004, 0.003))
+    ekf.add_relative(1.5, 1.7, T, PoseSigma(0.004, 0.003))
+    assert ekf.statistics()["visual accepted"] == 2
+
+
+def test_increments_backwards_in_time_are_refused():
+    ekf = BufferedEkf(CONFIG)
+    ekf.add_relative(1.0, 0.5, np.eye(4), PoseSigma(0.01, 0.01))
+    assert ekf.statistics() == {"out of order": 1}
+    assert ekf.state_at(1.0) is None
+
+
+def test_absolute_update_pulls_towards_the_accumulated_pose(rng):
+    ekf = run(telemetry(rng, 20), [], 0.0)
+    here = ekf.state_at(1.9)
+    T = se3.exp(np.r_[here.p_w, 0, 0, 0])
+    T[:3, 3] = here.p_w + [0.02, 0.0, 0.0]
+    ekf.add_absolute(1.9, T, PoseSigma(0.005, 0.01))
+    assert 0.005 < ekf.state_at(1.9).p_w[0] - here.p_w[0] < 0.02

@@ -1,0 +1,285 @@
+"""What telemetry says of camera positions, against flights whose truth is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.displacement import TelemetryModel
+from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
+from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
+from edgeslam_torch.types import TelemetrySample
+
+T_B_C = camera_on_body()
+
+
+def model_of(samples, R_w_m=None, scale=1.0, **changes):
+    track = TelemetryTrack("world", 0.35)
+    track.add(samples)
+    R = np.eye(3) if R_w_m is None else R_w_m
+    model = TelemetryModel(track, FusionConfig(), T_B_C, R, 0.0, 0.0, scale, 0.02, True, None, truncates=0.0)
+    return replace(model, **changes)
+
+
+@pytest.mark.parametrize("rate_rad_s", [2.0, 4.0])
+def test_readings_that_are_means_over_a_tenth_of_a_second_give_back_the_way(rate_rad_s):
+    """A swing of 10 cm: what the mean takes away, and what the trapezoid rule does, is put back."""
+    t = np.arange(0.0, 8.0, 0.1)
+    position = np.sin(rate_rad_s * np.stack([t - 0.05, t + 0.05])) / 10.0
+    track = TelemetryTrack("world", 0.35)
+    velocity = (position[1] - position[0]) / 0.1
+    track.add([TelemetrySample(s, np.array([v, 0.0, 0.0]), np.zeros(3)) for s, v in zip(t, velocity, strict=True)])
+    asked = np.arange(0.5, 7.0, 0.1)
+    moved = track.displacement(asked)[:, 0]
+    true = np.sin(rate_rad_s * asked) / 10.0
+    slope = np.polyfit(true, moved, 1)[0]
+    assert slope == pytest.approx(1.0, abs=0.001)
+
+
+def power_on_axes(motion):
+    """Rotation of the simulated world to the drone's power-on axes."""
+    forward = (motion.T_w_c[0, :3, :3] @ T_B_C[:3, :3].T)[:, 0]
+    yaw = np.arctan2(forward[1], forward[0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def flown(rng, motion, faults=EXACT, every=12, **changes):
+    """Model, stamps and true positions of some keyframes of a flight, all in power-on axes."""
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=faults, floor_m=0.0).samples()
+    chosen = np.arange(30, len(motion.stamps_s) - 30, every)
+    p = motion.T_w_c[chosen, :3, 3] @ power_on_axes(motion).T
+    return model_of(samples, **changes), motion.stamps_s[chosen], p
+
+
+def chi2(told, p):
+    x = p.ravel()
+    return float(x @ told.information @ x - 2 * told.vector @ x + told.constant)
+
+
+def best(told, p):
+    """Positions of least cost, as near to ``p`` as that leaves open."""
+    slope = told.vector - told.information @ p.ravel()
+    return p + (np.linalg.pinv(told.information, rcond=1e-10) @ slope).reshape(-1, 3)
+
+
+def centred(p):
+    return p - p.mean(axis=0)
+
+
+@pytest.mark.parametrize("height", [None, "tof"])
+def test_right_positions_cost_next_to_nothing_and_wrong_ones_are_mended(rng, swinging, height):
+    model, stamps, p = flown(rng, swinging(12.0), height=height, scale_sigma_log=0.02)
+    right = model.positions(stamps, p)
+    assert chi2(right, p) < 0.02 * right.rows
+    disturbed = p + rng.normal(0.0, 0.03, p.shape)
+    told = model.positions(stamps, disturbed)
+    assert chi2(told, disturbed) > 10.0 * chi2(told, p)
+    short = np.diff(best(told, disturbed), axis=0) - np.diff(p, axis=0)
+    assert np.abs(short).max() < 0.01
+
+
+@pytest.mark.parametrize("mirrored", [(-1, 1, 1), (1, -1, 1), (1, 1, -1)])
+def test_a_displacement_the_wrong_way_round_costs(rng, swinging, mirrored):
+    model, stamps, p = flown(rng, swinging(12.0))
+    told = model.positions(stamps, p)
+    assert chi2(told, p * mirrored) > 50.0 * told.rows
+
+
+@pytest.mark.parametrize("height", [None, "tof"])
+def test_the_scale_is_held_as_far_as_it_is_known(rng, swinging, height):
+    """A map 10 % too small: five sigmas of 2 %, nothing where the scale is free."""
+    model, stamps, p = flown(rng, swinging(12.0), height=height)
+    for sigma, least, most in ((0.02, 20.0, 30.0), (1.0, 0.0, 0.1)):
+        told = model.positions(stamps, p, sigma)
+        extra = chi2(told, 0.9 * p) - chi2(told, p)
+        assert least < extra < most
+        assert chi2(told, 1.1 * p) - chi2(told, p) == pytest.approx(extra, rel=0.3, abs=0.1)
+
+
+def test_a_map_whose_scale_drifts_is_straightened_without_knowing_the_scale(rng, swinging):
+    model, stamps, p = flown(rng, swinging(20.0))
+    growth = np.linspace(1.0, 1.4, len(p) - 1)[:, None]
+    drifted = np.vstack([p[:1], p[0] + np.cumsum(growth * np.diff(p, axis=0), axis=0)])
+    told = model.positions(stamps, drifted, 1.0)
+    mended = np.diff(best(told, drifted), axis=0)
+    ratio = np.linalg.norm(mended, axis=1) / np.linalg.norm(np.diff(p, axis=0), axis=1)
+    third = len(ratio) // 3
+    assert np.median(ratio[-third:]) / np.median(ratio[:third]) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("height", [None, "tof"])
+def test_a_map_that_disagrees_gains_nothing_by_being_small(rng, swinging, height):
+    """Where the scale is free, the cost is one of shape: its derivative by the map's logarithmic size is nothing."""
+    model, stamps, p = flown(rng, swinging(12.0), height=height)
+    bent = p + rng.normal(0.0, 0.05, p.shape)
+    told = model.positions(stamps, bent, 1.0)
+    by_size = 2.0 * float(bent.ravel() @ (told.information @ bent.ravel() - told.vector))
+    assert chi2(told, bent) > 5.0 * chi2(model.positions(stamps, p, 1.0), p)
+    assert abs(by_size) < 0.05 * chi2(told, bent)
+
+
+def climbed(speed_m_s):
+    """A drone that flies forward at some speed and climbs at .3 m/s, told every tenth of a second."""
+    velocity = np.array([speed_m_s, 0.0, 0.3])
+    samples = [TelemetrySample(s, velocity, np.array([0.0, 0.0, 1e-4 * s])) for s in np.arange(0.0, 8.0, 0.1)]
+    stamps = np.arange(1.0, 7.0, 0.5)
+    lever = T_B_C[:3, 3]
+    return model_of(samples, velocity=False, standing=True), stamps, stamps[:, None] * velocity + lever
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.3])
+@pytest.mark.parametrize("unit", [1.0, 8.0])
+def test_a_drone_that_stands_holds_a_map_whose_unit_is_not_known(rng, sigma, unit):
+    """What it tells of standing is right however wrong the unit is, and of its climb nothing is used."""
+    model, stamps, p = climbed(0.0)
+    model = replace(model, scale=unit, scale_sigma_log=sigma)
+    told = model.positions(stamps, p)
+    assert chi2(told, p) < 0.02 * told.rows
+    rises = p + np.linspace(0.0, 1.0, len(p))[:, None] * [0.0, 0.0, 1.0]
+    assert chi2(told, rises) == pytest.approx(chi2(told, p), abs=0.02 * told.rows)
+    slides = p + np.linspace(0.0, 3.0 / unit, len(p))[:, None] * [1.0, 0.0, 0.0]
+    assert chi2(told, slides) > 5.0 * told.rows
+    told = model.positions(stamps, slides)
+    assert chi2(told, slides) > 5.0 * told.rows, "no unit explains it"
+    np.testing.assert_allclose(np.ptp(best(told, slides)[:, :2], axis=0), 0.0, atol=1e-4)
+
+
+def test_a_drone_that_moves_does_not_hold_a_map_whose_unit_is_not_known(rng):
+    model, stamps, p = climbed(0.4)
+    told = model.positions(stamps, p)
+    ahead = p + np.linspace(0.0, 3.0, len(p))[:, None] * [1.0, 0.0, 0.0]
+    assert chi2(told, ahead) == pytest.approx(chi2(told, p), abs=0.02 * told.rows)
+    assert replace(model, standing=False).positions(stamps, p) is None
+    still = replace(model, velocity=True).positions(stamps, p)
+    assert chi2(still, ahead) > 5.0 * still.rows, "where velocities may speak all of them do"
+
+
+def test_gauge_of_the_map_does_not_matter(rng, swinging):
+    """The same flight in a turned, shifted map of other units."""
+    model, stamps, p = flown(rng, swinging(12.0), height="tof")
+    c, s = np.cos(0.7), np.sin(0.7)
+    R_w_m = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])
+    elsewhere = replace(model, R_w_m=R_w_m, scale=2.5)
+    wrong = p + rng.normal(0.0, 0.02, p.shape)
+    in_map = wrong @ R_w_m / 2.5 + [1.0, 2.0, 3.0]
+    here, there = model.positions(stamps, wrong), elsewhere.positions(stamps, in_map)
+    shifted = chi2(there, in_map - [1.0, 2.0, 3.0])
+    assert shifted == pytest.approx(chi2(here, wrong), rel=1e-6)
+
+
+def test_heights_hold_the_vertical_alone_and_up_is_up(rng, swinging):
+    model, stamps, p = flown(rng, swinging(12.0), velocity=False, height="tof")
+    told = model.positions(stamps, p)
+    sideways = p + [[0.3, -0.2, 0.0]] * rng.normal(size=(len(p), 1))
+    assert chi2(told, sideways) - chi2(told, p) < 1.0  # but for what a tilt of the map makes of it
+    assert chi2(told, p * [1, 1, -1]) > 5.0 * told.rows
+    assert chi2(told, p + [0.0, 0.0, 0.7]) == pytest.approx(chi2(told, p), abs=0.1)  # the floor's level is free
+
+
+def test_furniture_below_is_no_climb(rng, swinging):
+    motion = swinging(12.0)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT, floor_m=0.0).samples()
+    over = [replace(s, tof_m=s.tof_m - 0.4) if 4.0 < s.stamp_s < 7.0 else s for s in samples]
+    _, stamps, p = flown(rng, motion)
+    told = model_of(over, height="tof").positions(stamps, p)
+    assert chi2(told, p) < 0.1 * told.rows
+
+
+def test_wild_readings_are_refused(rng, swinging):
+    motion = swinging(12.0)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()
+    samples[60] = replace(samples[60], velocity_m_s=np.array([0.0, 0.0, 8.0]))
+    _, stamps, p = flown(rng, motion)
+    told = model_of(samples).positions(stamps, p)
+    assert 1 <= told.refused <= 2
+    assert chi2(told, p) < 0.2 * told.rows
+
+
+def test_an_outage_leaves_the_positions_across_it_alone(rng, swinging):
+    motion = swinging(20.0)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()
+    kept = [s for s in samples if not 8.0 < s.stamp_s < 10.0]
+    _, stamps, p = flown(rng, motion)
+    told = model_of(kept).positions(stamps, p)
+    apart = p + np.where(stamps > 9.0, 1.0, 0.0)[:, None]
+    assert chi2(told, apart) == pytest.approx(chi2(told, p), abs=1e-6)
+
+
+@pytest.mark.parametrize("truncated", [False, True])
+def test_chi_square_of_the_truth_is_what_it_should_be(swinging, truncated):
+    """Twenty draws of a Tello's telemetry: the covariance is neither too small nor much too large."""
+    motion, values = swinging(15.0), []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        faults = replace(EXACT, velocity_noise_m_s=0.03, velocity_walk=0.003, quantise=not truncated)
+        model, stamps, p = flown(rng, motion, faults)
+        if truncated:
+            cut = [replace(s, velocity_m_s=np.trunc(s.velocity_m_s / 0.1) * 0.1) for s in model.track._samples]
+            model = model_of(cut, truncates=1.0)
+        told = model.positions(stamps, p)
+        values.append(chi2(told, p) / (3 * told.rows))
+    assert 0.3 < np.mean(values) < 1.2
+
+
+def test_gravity_points_up(rng, swinging):
+    motion = swinging(12.0)
+    model, stamps, _ = flown(rng, motion, faults=replace(EXACT, quantise=True))
+    up = model.up(stamps)
+    chosen = np.searchsorted(motion.stamps_s, stamps[up.frame])
+    true = motion.T_w_c[chosen, 2, :3]
+    assert np.degrees(np.arccos(np.sum(up.up_c * true, axis=1).clip(-1, 1))).max() < 1.5
+    np.testing.assert_allclose(up.up_m, [0.0, 0.0, 1.0])
+
+
+def leaning(pitch_deg, **changes):
+    """Model of a drone with these pitches, ten a second."""
+    rpy = np.radians([[0.0, float(pitch), 0.0] for pitch in pitch_deg])
+    return model_of([TelemetrySample(0.1 * k, np.zeros(3), a) for k, a in enumerate(rpy)], **changes)
+
+
+def test_strong_lean_gives_no_vertical_before_the_scale_is_known():
+    """A drone that takes off leans by some degrees. A map of a camera that only turns has no parallax to tell a lean of
+    half a degree from motion: held by attitude its depths run away."""
+    for lean_deg, told in ((6.0, True), (20.0, False)):
+        model = leaning(np.where(np.arange(100) < 50, 0.0, lean_deg), scale_sigma_log=np.inf)
+        assert (model.up(np.array([3.0])) is not None) is told
+        assert np.degrees(model.up(np.array([1.0])).sigma_rad) == pytest.approx(2.0)
+        assert replace(model, scale_sigma_log=0.1).up(np.array([3.0])) is not None
+
+
+def test_silence_says_nothing(rng, swinging):
+    model, stamps, p = flown(rng, swinging(6.0))
+    assert model.positions(stamps[:1], p[:1]) is None
+    assert replace(model, velocity=False).positions(stamps, p) is None
+    assert model.positions(stamps + 100.0, p) is None
+    assert model.up(stamps + 100.0) is None
+    level = [TelemetrySample(0.1 * k, np.zeros(3), np.full(3, np.nan)) for k in range(50)]
+    assert model_of(level).up(stamps) is None
+
+
+def test_a_late_video_is_taken_into_account(rng, swinging):
+    motion = swinging(12.0)
+    faults = replace(EXACT, video_delay_s=0.5)
+    model, stamps, p = flown(rng, motion, faults, delay_s=0.5)
+    early = replace(model, delay_s=0.3)
+    right, wrong = model.positions(stamps, p), early.positions(stamps, p)
+    assert chi2(right, p) < 0.02 * right.rows
+    assert chi2(wrong, p) > 20.0 * chi2(right, p)
+    unsure = replace(early, delay_sigma_s=0.2).positions(stamps, p)
+    assert chi2(unsure, p) < 0.3 * chi2(wrong, p)
+    assert TelemetryFaults().video_delay_s == 0.5
+
+
+@pytest.mark.parametrize(("way_s", "least_m", "most_m"), [(0.5, 0.0145, 0.02), (8.0, 0.15, 0.2)])
+def test_a_drone_whose_reading_stays_the_same_does_not_fly_evenly(way_s, least_m, most_m):
+    """Half a second errs by the rounding as it is, .0145 m; eight would by .23, were it the same all the while."""
+    samples = [
+        TelemetrySample(t, np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.0, 1e-3 * t])) for t in np.arange(0.0, 12.0, 0.1)
+    ]
+    stamps = np.array([1.0, 1.0 + way_s])
+    p = np.array([[0.0, 0.0, 0.0], [0.3 * way_s, 0.0, 0.0]])
+    told = model_of(samples, scale_sigma_log=1e-6).positions(stamps, p)
+    assert least_m < told.information[3, 3] ** -0.5 < most_m

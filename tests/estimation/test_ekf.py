@@ -1,0 +1,238 @@
+import math
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.filter.ekf import Ekf, Outcome
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import (
+    euler_rate_matrix,
+    matrix_from_rpy,
+    mean_rotation,
+    rotation_vector,
+    rpy_from_matrix,
+    wrapped,
+)
+
+CONFIG = FusionConfig()
+
+
+def pose(p, rpy):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = matrix_from_rpy(np.array(rpy)), p
+    return T
+
+
+def test_rpy_and_matrix_are_inverse(rng):
+    for rpy in rng.uniform([-3.0, -1.5, -3.0], [3.0, 1.5, 3.0], (50, 3)):
+        np.testing.assert_allclose(rpy_from_matrix(matrix_from_rpy(rpy)), rpy, atol=1e-12)
+
+
+def test_yaw_turns_x_towards_y():
+    np.testing.assert_allclose(matrix_from_rpy(np.array([0.0, 0.0, math.pi / 2])) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-5, 0.3, 3.0])
+def test_rotation_vector_is_the_logarithm(angle):
+    phi = angle * np.array([0.6, 0.0, 0.8])
+    np.testing.assert_allclose(rotation_vector(se3.exp(np.r_[0, 0, 0, phi])[:3, :3]), phi, atol=1e-9)
+
+
+def test_euler_rates_match_a_numeric_derivative(rng):
+    rpy, step = rng.uniform(-1, 1, 3), 1e-6
+    for k in range(3):
+        moved = rpy + step * np.eye(3)[k]
+        turn = rotation_vector(matrix_from_rpy(moved) @ matrix_from_rpy(rpy).T) / step
+        np.testing.assert_allclose(euler_rate_matrix(rpy)[:, k], turn, atol=1e-5)
+
+
+def test_mean_of_rotations_around_one_is_that_one(rng):
+    R = matrix_from_rpy(np.array([0.1, -0.4, 2.0]))
+    around = np.array([R @ se3.exp(np.r_[0, 0, 0, v])[:3, :3] for v in rng.normal(0, 0.05, (400, 3))])
+    assert np.linalg.norm(rotation_vector(mean_rotation(around).T @ R)) < 0.01
+
+
+def test_world_velocity_moves_the_position_whatever_the_heading():
+    ekf = Ekf(CONFIG)
+    ekf.reset_pose(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    ekf.predict(0.5, np.array([1.0, 0.0, 0.2]))
+    np.testing.assert_allclose(ekf.state(0.5).p_w, [0.5, 0.0, 0.1], atol=1e-12)
+
+
+def test_body_velocity_is_turned_into_the_world_as_paper_equation_9_says():
+    ekf = Ekf(FusionConfig(velocity_frame="body"))
+    ekf.reset_pose(np.zeros(3), np.array([0.0, 0.0, math.pi / 2]))
+    ekf.predict(0.5, np.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(ekf.state(0.5).p_w, [0.0, 0.5, 0.0], atol=1e-12)
+
+
+def test_literal_process_noise_is_paper_equation_10_by_hand():
+    config = FusionConfig(literal=True, literal_beta=0.01, lambda_tau=0.5, initial_sigma_angle_rad=0.0)
+    ekf = Ekf(config)
+    ekf.predict(0.1, np.zeros(3), battery=0.6)  # beta (1 - b + lambda tau) = 0.01 (0.4 + 0.05)
+    np.testing.assert_allclose(ekf.state(0.1).covariance, 0.0045 * np.eye(6), atol=1e-15)
+
+
+def test_literal_noise_vanishes_on_a_full_battery_and_the_default_does_not():
+    literal, corrected = Ekf(FusionConfig(literal=True, lambda_tau=0.0)), Ekf(FusionConfig(lambda_tau=0.0))
+    for ekf in (literal, corrected):
+        before = ekf.P[0, 0]
+        ekf.predict(0.1, np.zeros(3), battery=1.0)
+        assert (ekf.P[0, 0] > before) == (ekf is corrected)
+
+
+def test_process_noise_grows_with_time_step_spent_battery_and_blind_time():
+    def variance(steps, dt, battery):
+        ekf = Ekf(CONFIG)
+        for _ in range(steps):
+            ekf.predict(dt, np.zeros(3), battery)
+        return ekf.P[0, 0] - CONFIG.sigma_bias_m_s**2 * (steps * dt) ** 2
+
+    assert variance(1, 0.2, 1.0) > 1.5 * variance(1, 0.1, 1.0)
+    assert variance(1, 0.1, 0.2) > 1.4 * variance(1, 0.1, 1.0)
+    assert variance(40, 0.1, 1.0) > 1.3 * 40 * variance(1, 0.1, 1.0)
+
+
+def test_angle_innovation_wraps_across_pi():
+    ekf = Ekf(CONFIG)
+    ekf.reset_pose(np.zeros(3), np.array([0.0, 0.0, math.pi - 0.01]))
+    assert ekf.update_attitude(np.array([0.0, 0.0, -math.pi + 0.01])) is Outcome.ACCEPTED
+    assert abs(wrapped(ekf.state(0.0).rpy_rad[2] - math.pi)) < 0.02
+
+
+def test_literal_filter_does_not_wrap_and_swings_through_zero():
+    ekf = Ekf(FusionConfig(literal=True))
+    ekf.reset_pose(np.zeros(3), np.array([0.0, 0.0, math.pi - 0.01]))
+    ekf.update_attitude(np.array([0.0, 0.0, -math.pi + 0.01]))
+    assert abs(ekf.state(0.0).rpy_rad[2]) < math.pi - 0.5
+
+
+def test_gate_refuses_a_jump_and_recovers_when_it_stays():
+    ekf = Ekf(CONFIG)
+    wrong = np.array([0.0, 0.0, 0.8])
+    outcomes = [ekf.update_attitude(wrong) for _ in range(CONFIG.refusals_before_recovery)]
+    assert outcomes[:-1] == [Outcome.REFUSED] * (CONFIG.refusals_before_recovery - 1)
+    assert outcomes[-1] is Outcome.RECOVERED
+    assert abs(ekf.state(0.0).rpy_rad[2] - 0.8) < 0.1
+
+
+def test_one_refusal_leaves_the_state_alone():
+    ekf = Ekf(CONFIG)
+    before = ekf.state(0.0)
+    assert ekf.update_attitude(np.array([0.0, 0.9, 0.0])) is Outcome.REFUSED
+    np.testing.assert_array_equal(ekf.state(0.0).rpy_rad, before.rpy_rad)
+    np.testing.assert_array_equal(ekf.state(0.0).covariance, before.covariance)
+
+
+def test_not_finite_measurements_change_nothing():
+    ekf = Ekf(CONFIG)
+    assert ekf.update_attitude(np.array([0.0, np.nan, 0.0])) is Outcome.NOT_FINITE
+    assert np.isfinite(ekf.P).all()
+
+
+def test_exact_relative_poses_lead_along_the_true_path(rng):
+    # Sure of its attitude: velocities would correct it. At 95 % the gate refuses three of sixty good ones.
+    ekf = Ekf(FusionConfig(gate_probability=0.9999, initial_sigma_angle_rad=0.0))
+    truth = pose([0.0, 0.0, 0.0], [0.0, 0.0, 0.3])
+    ekf.reset_pose(truth[:3, 3], np.array([0.0, 0.0, 0.3]))
+    for _ in range(60):
+        step = se3.exp(np.r_[rng.normal(0, 0.05, 3), rng.normal(0, 0.02, 3)])
+        before, after = (rpy_from_matrix(T[:3, :3]) for T in (truth, truth @ step))
+        rates = wrapped(after - before) / 0.1 + rng.normal(0, 0.1, 3)
+        ekf.predict(0.1, truth[:3, :3] @ step[:3, 3] / 0.1 + rng.normal(0, 0.03, 3), rpy_rate_rad_s=rates)
+        truth = truth @ step
+        ekf.update_relative(step, 1e-4, 1e-4)
+        ekf.clone()
+    state = ekf.state(6.0)
+    assert np.linalg.norm(state.p_w - truth[:3, 3]) < 0.01
+    assert np.linalg.norm(rotation_vector(matrix_from_rpy(state.rpy_rad).T @ truth[:3, :3])) < 0.01
+
+
+def test_relative_measurement_moves_the_state_the_shortest_way_onto_itself(rng):
+    """Without noise and with equal variances the step is ``H^T (H H^T)^-1 r``, whatever the residual's coordinates."""
+    x = np.r_[
+        rng.normal(0, 1, 3), rng.uniform(-0.6, 0.6, 3), np.zeros(3), rng.normal(0, 1, 3), rng.uniform(-0.6, 0.6, 3)
+    ]
+    T = se3.inverse(pose(x[9:12], x[12:15])) @ pose(x[:3], x[3:6])
+
+    def residual(state):
+        seen = se3.inverse(pose(state[9:12], state[12:15])) @ pose(state[:3], state[3:6])
+        return se3.log(se3.inverse(T) @ seen)
+
+    H = np.array([(residual(x + 1e-6 * e) - residual(x - 1e-6 * e)) / 2e-6 for e in np.eye(15)]).T
+    for _ in range(20):
+        off = 1e-4 * rng.normal(size=15)
+        ekf = Ekf(CONFIG)
+        ekf.x, ekf.P = x + off, np.eye(15)
+        assert ekf.update_relative(T, 1e-6, 1e-6) is Outcome.ACCEPTED
+        step = -H.T @ np.linalg.solve(H @ H.T, H @ off)
+        np.testing.assert_allclose(ekf.x - x - off, step, atol=3e-6)
+
+
+def test_covariance_stays_symmetric_and_positive(rng):
+    ekf = Ekf(CONFIG)
+    for k in range(300):
+        ekf.predict(0.1, rng.normal(0, 1, 3), battery=1.0 - k / 400)
+        ekf.update_attitude(ekf.x[3:6] + rng.normal(0, 0.005, 3))
+        if k % 3 == 0:
+            ekf.update_relative(np.eye(4), 0.05, 0.01)
+            ekf.clone()
+    np.testing.assert_array_equal(ekf.P, ekf.P.T)
+    assert np.linalg.eigvalsh(ekf.P[:9, :9]).min() > 0
+
+
+CHI2_95 = {3: 7.815, 6: 12.592}
+"""95 % quantiles of chi-square, from tables."""
+
+
+@pytest.mark.parametrize("degrees", [3, 6])
+@pytest.mark.parametrize(("share", "outcome"), [(0.97, Outcome.ACCEPTED), (1.03, Outcome.REFUSED)])
+def test_gate_is_the_95_percent_quantile(degrees, share, outcome):
+    """One attitude, or one pose, whose innovation is a little within or a little beyond that ellipsoid."""
+    ekf = Ekf(CONFIG)
+    ekf.predict(0.5, np.zeros(3))
+    P = ekf.state(0.0).covariance
+    if degrees == 3:
+        sigma = math.sqrt(P[3, 3] + CONFIG.sigma_attitude_rad**2)
+        told = ekf.update_attitude(np.array([math.sqrt(share * CHI2_95[3]) * sigma, 0.0, 0.0]))
+    else:
+        sigma = math.sqrt(P[0, 0] + 0.05**2)
+        told = ekf.update_absolute(np.array([math.sqrt(share * CHI2_95[6]) * sigma, 0.0, 0.0]), np.zeros(3), 0.05, 0.02)
+    assert told is outcome
+    assert ekf.nis == pytest.approx(share * CHI2_95[degrees], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"sigma_velocity_m_s": 0.0},
+        {"beta": -1.0},
+        {"gate_probability": 1.0},
+        {"delay_range_s": (1.0, 0.0)},
+        {"velocity_frame": "camera"},
+        {"refusals_before_recovery": 0},
+    ],
+)
+def test_settings_out_of_range_are_refused_by_name(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        FusionConfig(**wrong)
+
+
+def test_recovering_for_ever_leaves_a_covariance(rng):
+    """A map that goes its own way, refused and taken in again and again: the absolute place is measured by nothing, and
+    must not become so unknown that what is known of the last second drowns in rounding (a flight ended so)."""
+    ekf = Ekf(CONFIG)
+    recovered = 0
+    for _ in range(600):
+        ekf.clone()
+        for _ in range(3):
+            ekf.predict(0.03, rng.normal(0.0, 0.2, 3))
+        moved = pose(rng.normal(0.0, 0.5, 3), rng.normal(0.0, 0.2, 3))
+        recovered += ekf.update_relative(moved, 0.005, 0.003) is Outcome.RECOVERED
+        recovered += ekf.update_attitude(rng.normal(0.0, 0.5, 3)) is Outcome.RECOVERED
+        assert np.diag(ekf.since_clone(np.zeros(3)).covariance).min() > 0.0
+    assert recovered > 50
+    assert np.diag(ekf.P).max() < 1e6
+    eigenvalues = np.linalg.eigvalsh(ekf.P)
+    assert eigenvalues[0] > -1e-12 * eigenvalues[-1]

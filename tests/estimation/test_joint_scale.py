@@ -1,0 +1,283 @@
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.estimation.scale.joint_scale import (
+    aged_since,
+    displacement_evidence,
+    height_evidence,
+    solved,
+    turned_since,
+)
+from edgeslam_torch.estimation.scale.log_scale import floor_segments
+from edgeslam_torch.geometry.rotations import matrix_from_rpy
+
+TILT = math.radians(3.0)
+SCALE = 2.5
+
+
+def path(n=80, size_m=0.4):
+    """Positions every half second of a swing in three axes [m]."""
+    t = 0.5 * np.arange(n + 1)
+    return t, size_m * np.stack([np.sin(0.9 * t), np.sin(0.7 * t + 1.0), 0.6 * np.sin(1.1 * t + 2.0)], axis=1)
+
+
+def moved(rng, n=80, noise_m=0.0094, noise_map_m=0.0, bias=None, R=None):
+    t, p = path(n)
+    d = np.diff(p, axis=0)
+    seen = np.diff(p + noise_map_m * rng.standard_normal(p.shape), axis=0) / SCALE
+    told = d + noise_m * rng.standard_normal(d.shape) + (0.0 if bias is None else 0.5 * bias)
+    return t[:-1], seen if R is None else seen @ R, told
+
+
+def displaced(t, seen, told, sigma_map_m=1e-4, sigma_m=0.0094):
+    n = len(t)
+    sigma_map = np.full(n, sigma_map_m / SCALE)
+    return displacement_evidence(seen, told, t, np.full(n, 0.5), sigma_map, np.full(n, sigma_m), TILT)
+
+
+def flown(rng, n=300, noise_m=0.012, tilt=(0.0, 0.0), step=None):
+    """Heights at 10 Hz above a floor that may have furniture on it, and a map that may be tilted."""
+    t = 0.1 * np.arange(n)
+    p = 0.5 * np.stack([np.sin(0.3 * t), np.cos(0.4 * t), 0.5 * np.sin(0.5 * t)], axis=1)
+    z = p[:, 2] + 1.0 + noise_m * rng.standard_normal(n)
+    if step is not None:
+        z[step] -= 0.4
+    return t, p @ matrix_from_rpy(np.array([*tilt, 0.0])).T / SCALE, z
+
+
+def heights(t, p, z):
+    segment = floor_segments(t, z, SCALE * p[:, 2], 0.08)
+    return height_evidence(p, z, t, segment, 1e-4, 0.015, SCALE, TILT)
+
+
+def errors(draw, count):
+    """Log error of the scale and its ratio to the stated sigma, over draws."""
+    out = []
+    for _ in range(count):
+        s, sigma = solved(draw(), TILT)
+        out.append((math.log(s / SCALE), math.log(s / SCALE) / sigma))
+    return np.array(out).T
+
+
+def test_exact_displacements_give_the_exact_scale(rng):
+    assert solved([displaced(*moved(rng, noise_m=0.0))], TILT)[0] == pytest.approx(SCALE, rel=1e-4)
+
+
+def test_stated_sigma_is_that_of_the_errors(rng):
+    _, ratio = errors(lambda: [displaced(*moved(rng))], 60)
+    assert 0.6 < np.std(ratio) < 1.4  # 60 draws: one sigma of the standard deviation is 0.09
+    assert abs(np.mean(ratio)) < 0.5
+
+
+def test_parts_of_a_flight_that_differ_in_scale_widen_sigma(rng):
+    """A map that has grown by a third while it was made: the mean is no surer than its parts are alike."""
+    growing = np.repeat([0.85, 0.95, 1.05, 1.15], 20)[:, None]
+
+    def drifting():
+        t, seen, told = moved(rng)
+        return [displaced(t, seen * growing, told)]
+
+    error, ratio = errors(drifting, 20)
+    _, steady = solved([displaced(*moved(rng))], TILT)
+    _, sigma = solved(drifting(), TILT)
+    assert sigma > 4 * steady
+    assert 0.04 < sigma < 0.12
+    assert np.abs(error).max() < 0.06
+    assert np.abs(ratio).max() < 1.0
+
+
+def test_noise_of_both_sides_does_not_shrink_the_scale(rng):
+    error, _ = errors(lambda: [displaced(*moved(rng, 100, noise_map_m=0.03), math.sqrt(2) * 0.03)], 30)
+    assert abs(np.mean(error)) < 0.02
+
+
+def test_a_map_that_drifts_does_not_shrink_the_scale(rng):
+    """Unmodelled, correlated pose errors of 25 mm lengthen the visual path by 2 %."""
+
+    def drifting():
+        t, p = path(120, 0.25)
+        walk = np.zeros_like(p)
+        for k in range(1, len(p)):
+            walk[k] = 0.88 * walk[k - 1] + math.sqrt(1 - 0.88**2) * 0.025 * rng.standard_normal(3)
+        t, p, seen = t[::2], p[::2], (p + walk)[::2]
+        told = np.diff(p, axis=0) + 0.0094 * rng.standard_normal((len(p) - 1, 3))
+        n = len(told)
+        sigma_map, sigma_m = np.full(n, 1e-4), np.full(n, 0.0094)
+        return [
+            displacement_evidence(np.diff(seen, axis=0) / SCALE, told, t[:-1], np.ones(n), sigma_map, sigma_m, TILT)
+        ]
+
+    error, ratio = errors(drifting, 40)
+    assert abs(np.mean(error)) < 0.008
+    assert np.sqrt(np.mean(ratio**2)) < 1.5
+
+
+def test_a_velocity_bias_that_walks_does_not_pull_the_scale(rng):
+    def biased():
+        walk = 0.03 * rng.standard_normal(3) + 0.01 * np.cumsum(rng.standard_normal((80, 3)), axis=0) * math.sqrt(0.5)
+        return [displaced(*moved(rng, bias=walk))]
+
+    error, ratio = errors(biased, 30)
+    assert np.sqrt(np.mean(error**2)) < 0.03
+    assert np.sqrt(np.mean(ratio**2)) < 1.6
+
+
+def test_the_bias_at_the_end_is_reported(rng):
+    bias = np.array([0.05, -0.04, 0.0])
+    np.testing.assert_allclose(displaced(*moved(rng, bias=bias)).bias, bias, atol=0.02)
+
+
+def test_a_rotation_of_the_map_costs_no_scale(rng):
+    R = matrix_from_rpy(np.array([0.02, -0.03, 0.05]))
+    error, _ = errors(lambda: [displaced(*moved(rng, R=R))], 10)
+    assert abs(np.mean(error)) < 0.01
+
+
+def test_a_fifth_of_frozen_readings_does_not_pull_the_scale(rng):
+    t, seen, told = moved(rng)
+    told[20:36] = told[19]
+    assert solved([displaced(t, seen, told)], TILT)[0] == pytest.approx(SCALE, rel=0.04)
+
+
+def test_too_little_says_nothing(rng):
+    t, seen, told = moved(rng)
+    assert displaced(t[:5], seen[:5], told[:5]) is None
+    assert displaced(t, 0.0 * seen, told) is None
+    t, p, z = flown(rng)
+    assert heights(t[:8], p[:8], z[:8]) is None
+
+
+def test_height_gives_the_scale_of_a_tilted_map(rng):
+    """One degree of tilt over half a metre is a centimetre of height: left out, 4 % of this motion."""
+    error, ratio = errors(lambda: [heights(*flown(rng, tilt=(0.02, -0.02)))], 20)
+    assert np.sqrt(np.mean(error**2)) < 0.015
+    assert np.sqrt(np.mean(ratio**2)) < 1.6
+
+
+def test_furniture_below_does_not_pull_the_height(rng):
+    s, sigma = solved([heights(*flown(rng, step=slice(120, 160)))], TILT)
+    assert s == pytest.approx(SCALE, rel=0.04)
+    assert sigma < 0.05
+
+
+def test_both_together_say_more_than_either(rng):
+    moves, height = displaced(*moved(rng)), heights(*flown(rng))
+    together = solved([moves, height], TILT)[1]
+    assert together < min(solved([moves], TILT)[1], solved([height], TILT)[1])
+
+
+def test_an_error_that_no_averaging_removes_bounds_the_sigma(rng):
+    evidence = displaced(*moved(rng, 200))
+    s, sigma = solved([evidence], TILT)
+    softened = solved([evidence.softened(0.05 * SCALE)], TILT)
+    assert softened[0] == pytest.approx(s, rel=1e-3)
+    assert softened[1] == pytest.approx(math.hypot(sigma, 0.05), rel=0.02)
+
+
+def test_a_noisy_map_does_not_shrink_the_scale_from_height(rng):
+    """A climb of 12 cm to and fro, seen with 5 cm of noise: as a regressor it would shrink the scale by 8 %."""
+
+    def noisy():
+        t, p, z = flown(rng, 600)
+        p[:, 2] *= 0.5
+        z = 1.0 + SCALE * p[:, 2] + 0.012 * rng.standard_normal(len(z))
+        seen = p + 0.05 / SCALE * rng.standard_normal(p.shape)
+        segment = np.zeros(len(t), dtype=np.int64)
+        return [height_evidence(seen, z, t, segment, 0.05 / SCALE, 0.015, SCALE, TILT)]
+
+    error, _ = errors(noisy, 40)
+    assert abs(np.mean(error)) < 0.03
+
+
+def test_height_and_displacements_mean_the_same_tilt(rng):
+    """A map tilted by three degrees: displacements and heights must estimate the same tilt."""
+    lean = matrix_from_rpy(np.array([0.05, -0.05, 0.0]))
+    t, p, z = flown(rng, 300, tilt=(0.05, -0.05))
+    moves = displaced(*moved(rng, 200, noise_m=0.002, R=lean.T), sigma_m=0.002)
+    together = solved([moves.softened(0.2 * SCALE), heights(t, p, z)], TILT)
+    assert together[0] == pytest.approx(SCALE, rel=0.02)
+    assert together[1] < 0.02
+
+
+# -- a map that drifts in scale ------------------------------------------------------------------------------------
+
+
+def climbed_then_level(rng, drift):
+    """Climb for two seconds, then level flight for ten; the map's first two seconds are ``drift`` shorter."""
+    t = 0.5 * np.arange(25)
+    step = np.where(t[:, None] < 2.0, [0.0, 0.0, 0.25], [0.2, 0.05, 0.0]) + 0.03 * rng.standard_normal((25, 3))
+    seen = step * np.where(t < 2.0, math.exp(-drift), 1.0)[:, None] / SCALE
+    told = step + 0.0094 * rng.standard_normal(step.shape)
+    return t, seen, told
+
+
+def climbed(rng, drift):
+    """Heights of the same flight at 10 Hz."""
+    t = 0.1 * np.arange(120)
+    z = 0.5 * np.minimum(t, 2.0)
+    p = np.stack([0.4 * np.maximum(t - 2.0, 0.0), 0.0 * t, z * math.exp(-drift)], axis=1) / SCALE
+    return t, p, z + 0.012 * rng.standard_normal(120)
+
+
+def test_the_present_scale_follows_a_map_that_has_drifted_since_the_climb(rng):
+    """By 15 %: one scale for all lies between the two; the present one is right within its sigma."""
+    present, throughout = [], []
+    for _ in range(12):
+        t, seen, told = climbed_then_level(rng, 0.15)
+        given = (seen, told, t, np.full(25, 0.5), np.full(25, 1e-3 / SCALE), np.full(25, 0.0094), TILT)
+        for found, aged in ((present, aged_since(t + 0.5, 0.0, 12.5)), (throughout, None)):
+            s, sigma = solved([displacement_evidence(*given, aged)], TILT)
+            found.append((math.log(s / SCALE), sigma))
+    now, all_along = np.array(present), np.array(throughout)
+    assert abs(now[:, 0].mean()) < 0.7 * all_along[:, 0].mean()
+    assert np.sqrt(np.mean((now[:, 0] / now[:, 1]) ** 2)) < 1.5
+
+
+def test_the_present_scale_follows_a_map_that_shrinks_all_along(rng):
+    """Along bare walls a map's scale triples in ten seconds. No walk explains so steady a change fully."""
+    off, throughout = [], []
+    for _ in range(7):
+        t = 0.5 * np.arange(24)
+        step = np.stack([0.3 * np.cos(0.3 * t), 0.3 * np.sin(0.3 * t), 0.02 * np.sin(t)], axis=1)
+        seen = step * np.exp(1.2 * (1.0 - t / t[-1]))[:, None] / SCALE
+        told = step + 0.0094 * rng.standard_normal(step.shape)
+        given = (seen, told, t, np.full(24, 0.5), np.full(24, 1e-3 / SCALE), np.full(24, 0.0094), TILT)
+        evidence = displacement_evidence(*given, aged_since(t + 0.5, 0.0, 12.0))
+        off.append((math.log(solved([evidence], TILT)[0] / SCALE), evidence.wander))
+        throughout.append(math.log(solved([displacement_evidence(*given)], TILT)[0] / SCALE))
+    error, wander = np.median(np.array(off), axis=0)
+    assert abs(error) < 0.3 < 0.5 < abs(np.median(throughout))
+    assert wander > 0.2
+
+
+def test_heights_of_an_old_climb_are_less_sure_of_the_present_scale(rng):
+    """A climb ten seconds ago of a map that is 10 % off there: covered, the surer the younger the climb."""
+    t, p, z = climbed(rng, 0.1)
+    segment = np.zeros(len(t), int)
+    sigmas = []
+    for until, aged in ((40, True), (120, True), (120, False)):
+        given = (p[:until], z[:until], t[:until], segment[:until], 1e-4, 0.015, SCALE, TILT)
+        s, sigma = solved([height_evidence(*given, aged_since(t[:until], 0.0, t[until - 1]) if aged else None)], TILT)
+        sigmas.append(sigma)
+        assert s == pytest.approx(SCALE * math.exp(0.1), rel=0.03)
+    assert sigmas[0] < 0.8 * sigmas[1]
+    assert sigmas[2] < 0.8 * sigmas[1]
+
+
+def test_log_age_grows_most_in_a_new_map():
+    aged = aged_since(np.array([-1.0, 0.0, 1.0, 9.0, 19.0]), 0.0, 19.0)
+    assert aged == pytest.approx([math.log(20.0), math.log(20.0), math.log(10.0), math.log(2.0), 0.0])
+
+
+def test_widths_of_view_since_a_turn():
+    """To the side by 90 degrees and back by 30: what was seen before the turn is most of two views away."""
+    yaw = np.deg2rad([0.0, 0.0, 45.0, 90.0, 75.0, 60.0])
+    T = np.tile(np.eye(4), (6, 1, 1))
+    T[:, :3, :3] = Rotation.from_euler("Y", yaw[:, None]).as_matrix()
+    np.testing.assert_allclose(turned_since(T), [1.0, 1.0, 0.5, 0.5, 0.25, 0.0], atol=1e-6)
+    moved = T.copy()
+    moved[:, :3, 3] = 5.0
+    np.testing.assert_allclose(turned_since(moved), turned_since(T))

@@ -1,0 +1,103 @@
+"""Flights that tell little of metres: what is stated of them holds."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.motion import MotionFusion
+from edgeslam_torch.eval.metrics.align import umeyama
+from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
+
+T_B_C = camera_on_body()
+STAMPS_S = np.arange(0.0, 24.0, 0.1)
+
+
+def turning(rng, size_m=0.07):
+    """Camera ``(N, 4, 4)`` that turns by half a radian to and fro about each axis and wanders by some centimetres."""
+    rate, phase = rng.uniform(0.7, 1.5, (2, 3)), rng.uniform(0.0, 2.0 * np.pi, (2, 3))
+    angle, way = (np.sin(np.outer(STAMPS_S, rate[k]) + phase[k]) for k in (0, 1))
+    T = np.tile(np.eye(4), (len(STAMPS_S), 1, 1))
+    T[:, :3, :3] = Rotation.from_euler("ZYX", 0.5 * angle).as_matrix()
+    T[:, :3, 3] = size_m * way + [0.0, 0.0, 1.2]
+    return T @ T_B_C
+
+
+def mapped(rng, T_w_c, growth):
+    """The same in a map whose unit changes: ``growth`` ``(N - 1,)`` times the true way from one frame to the next."""
+    T = T_w_c.copy()
+    steps = growth[:, None] * np.diff(T_w_c[:, :3, 3], axis=0)
+    T[1:, :3, 3] = T[0, :3, 3] + np.cumsum(steps, axis=0)
+    T[:, :3, 3] += 0.003 * rng.standard_normal((len(T), 3))
+    return T
+
+
+def truncated(sample):
+    return replace(sample, velocity_m_s=0.1 * np.trunc(10.0 * sample.velocity_m_s))
+
+
+def in_the_end(T_w_c, T_m_c, rng, change=lambda sample: sample, faults=None):
+    """Fusion that has seen all of a flight, in its map as it is at last."""
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    fusion.add_telemetry([change(s) for s in simulate(rng, STAMPS_S, T_w_c, T_B_C, faults=faults).samples()])
+    fusion.add_earlier(STAMPS_S, T_m_c, 0.003, 0.002)
+    fusion.revise(STAMPS_S, T_m_c)
+    return fusion
+
+
+def sigmas_off(fusion, T_m_c, T_w_c):
+    """Error of the stated scale in its own sigmas, against the similarity that lays the map on the truth."""
+    scale = fusion.scale()
+    true = umeyama(T_m_c[:, :3, 3], T_w_c[:, :3, 3]).scale
+    return abs(math.log(scale.value / true)) * scale.value / scale.sigma
+
+
+def as_it_is(rng):
+    return np.ones(len(STAMPS_S) - 1)
+
+
+def by_views(rng):
+    """Another unit in each of four stretches of the flight, by a seventh."""
+    return np.repeat(np.exp(0.15 * rng.standard_normal(4)), len(STAMPS_S) // 4)[: len(STAMPS_S) - 1]
+
+
+def torn(rng):
+    """The first three seconds take turns for ways, as maps without parallax do."""
+    return np.where(STAMPS_S[1:] < 3.0, 7.0, 1.0)
+
+
+@pytest.mark.parametrize(("grow", "metric"), [(as_it_is, True), (by_views, True), (torn, False)])
+def test_stated_sigma_of_rotation_in_place_covers_the_truth(grow, metric):
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        T_w_c = turning(rng)
+        T_m_c = mapped(rng, T_w_c, grow(rng))
+        fusion = in_the_end(T_w_c, T_m_c, rng)
+        assert (fusion.metres.sensor_scale is not None) == metric
+        assert sigmas_off(fusion, T_m_c, T_w_c) < 2.0
+        assert metric or any("too badly" in said for said in fusion.warnings())
+
+
+def test_velocities_in_another_unit_than_the_heights_are_not_explained_by_truncation():
+    """Half of each velocity is nearly what truncation would leave of it, and heights would decide for that."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        T_w_c = turning(rng, size_m=0.18)
+        T_m_c = mapped(rng, T_w_c, as_it_is(rng))
+        half = in_the_end(T_w_c, T_m_c, rng, lambda s: replace(s, velocity_m_s=0.5 * s.velocity_m_s))
+        assert half.metres.sensor_scale is None
+        assert any("contradict each other" in said for said in half.warnings())
+
+
+def test_truncated_velocities_give_the_scale():
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        T_w_c = turning(rng, size_m=0.18)
+        T_m_c = mapped(rng, T_w_c, as_it_is(rng))
+        fusion = in_the_end(T_w_c, T_m_c, rng, truncated, TelemetryFaults(quantise=False))
+        assert "telemetry" in fusion.metres.sensor_scale.source
+        assert sigmas_off(fusion, T_m_c, T_w_c) < 2.0
