@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.optim.kernels.compiled import compiled
+from edgeslam_torch.compiled import compiled
 from edgeslam_torch.types import FloatArray, IntArray
 
 MIN_DEPTH = 1e-6

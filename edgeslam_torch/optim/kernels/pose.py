@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.optim.kernels.compiled import compiled
+from edgeslam_torch.compiled import compiled
 from edgeslam_torch.types import FloatArray
 
 FAR_SIGMA = 1000.0

@@ -7,7 +7,7 @@ With the point :math:`P = R p + t` in the camera, its normalised coordinates :ma
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.optim.kernels.compiled import compiled
+from edgeslam_torch.compiled import compiled
 from edgeslam_torch.types import FloatArray, IntArray
 
 MIN_DEPTH = 1e-6

@@ -36,7 +36,7 @@ class _Notice(event.Listener):
     def on_start(self, event: Any) -> None:
         if not self.said:
             self.said = True
-            logger.warning("compiling the solver; once on this machine, some seconds")
+            logger.warning("compiling; once on this machine, some seconds")
 
     def on_end(self, event: Any) -> None:
         pass
