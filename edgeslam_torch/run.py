@@ -12,6 +12,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import FrameType, ModuleType
@@ -24,8 +25,9 @@ from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.config_file import to_toml
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
+from edgeslam_torch.imu import ImuModel, Reading
 from edgeslam_torch.readers.flight_folder import telemetry_gap
-from edgeslam_torch.readers.pace import Counter, TelemetryCursor, at_their_pace
+from edgeslam_torch.readers.pace import Counter, ReadingsCursor, at_their_pace
 from edgeslam_torch.readers.read_ahead import read_ahead
 from edgeslam_torch.readers.source import Source
 from edgeslam_torch.types import (
@@ -38,7 +40,6 @@ from edgeslam_torch.types import (
     ScaleEstimate,
     SlamOutput,
     Support,
-    TelemetrySample,
 )
 from edgeslam_torch.writers.map_picture import write_map_picture
 from edgeslam_torch.writers.observations import write_observations
@@ -75,7 +76,7 @@ class Slam(Protocol):
     def prepare(self, frame: Frame) -> Any:
         """Feature extraction that does not depend on earlier frames."""
 
-    def step(self, frame: Frame, telemetry: Sequence[TelemetrySample] = (), prepared: Any = None) -> SlamOutput:
+    def step(self, frame: Frame, readings: Sequence[Reading] = (), prepared: Any = None) -> SlamOutput:
         """Pose of one frame."""
 
     def finish(self) -> None:
@@ -203,12 +204,9 @@ def run(
     """
     config, atlas = config or SlamConfig(), atlas or AtlasFiles()
     with closing(source), closing(RunWriter(Path(out_dir), [Path(source.location)], to_toml(config))) as writer:
-        slam = (make_slam or _edge_slam)(source.camera, config, mode is Mode.REALTIME)
+        slam = (make_slam or partial(_edge_slam, imu=source.imu))(source.camera, config, mode is Mode.REALTIME)
         if atlas.load is not None:
             slam.load_atlas(atlas.load)
-        force = getattr(source, "force", None)
-        if force is not None and hasattr(slam, "feel"):
-            slam.feel(force)
         return _Run(source, writer, slam, config, mode, listeners, atlas).go()
 
 
@@ -283,13 +281,13 @@ class _Run:
         if self.mode is Mode.REALTIME and not self.source.live:
             frames = at_their_pace(frames, self.dropped)
         prepared = self._prepared(frames)
-        telemetry = TelemetryCursor(self.source.telemetry)
+        readings = ReadingsCursor(self.source)
         try:
             while (item := self._next(prepared)) is not None:
                 frame, features = item
                 self._count_missed(frame)
                 started = time.perf_counter()
-                output = self.slam.step(frame, telemetry.until(frame.stamp_s), features)
+                output = self.slam.step(frame, readings.until(frame.stamp_s), features)
                 step_ms = 1e3 * (time.perf_counter() - started)
                 self.tally.add(output, step_ms)
                 if not self.writer.append(output, step_ms, self._image_name(frame)):
@@ -455,12 +453,12 @@ class _Interrupt:
             raise KeyboardInterrupt
 
 
-def _edge_slam(camera: Camera, config: SlamConfig, realtime: bool) -> Slam:
+def _edge_slam(camera: Camera, config: SlamConfig, realtime: bool, imu: ImuModel | None = None) -> Slam:
     if "edgeslam_torch.slam" not in sys.modules:
         _load_slam()
     from edgeslam_torch.slam import EdgeSlam
 
-    return EdgeSlam(camera, config, realtime=realtime)
+    return EdgeSlam(camera, config, realtime=realtime, imu=imu)
 
 
 def _load_slam() -> None:

@@ -1,4 +1,4 @@
-"""EdgeSlam: one camera and a drone's telemetry in, a metric pose for every frame and an edge map out.
+"""EdgeSlam: one camera, an IMU and a drone's telemetry in, a metric pose for every frame and an edge map out.
 
 Read `types.py` first, then `states/machine.py`. `EdgeSlam` assembles the parts, passes every frame to the current
 state, and returns the results.
@@ -29,8 +29,9 @@ from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.frontend.repeats import REPEATED, RepeatedImages
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.geometry.level import SpecificForce, Up
+from edgeslam_torch.geometry.level import Up
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.imu import ImuModel, ImuReadings, Reading, check_readings, separated
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.observed import observations
 from edgeslam_torch.map.slam_map import SlamMap
@@ -65,9 +66,7 @@ from edgeslam_torch.types import (
     ScaleEstimate,
     SlamOutput,
     Support,
-    TelemetrySample,
     check_frame,
-    check_telemetry,
 )
 
 _AROUND = 8
@@ -86,11 +85,12 @@ class EdgeSlam:
         realtime: Map keyframes on a worker thread while tracking continues; a keyframe that would have to wait is
             skipped and counted. Results then depend on timing.
         executor: Single-thread executor instead of the one that ``realtime`` creates.
+        imu: Noise, mount and clock of the IMU whose readings `step` is given; those of a cheap one when None.
 
     Example:
-        >>> slam = EdgeSlam(source.camera)                                   # doctest: +SKIP
-        >>> for frame, telemetry in source.steps():                          # doctest: +SKIP
-        ...     print(slam.step(frame, telemetry).T_w_c[:3, 3])
+        >>> slam = EdgeSlam(source.camera, imu=source.imu)                   # doctest: +SKIP
+        >>> for frame, readings in source.steps():                           # doctest: +SKIP
+        ...     print(slam.step(frame, readings).T_w_c[:3, 3])
         >>> slam.finish()                                                    # doctest: +SKIP
         >>> stamps, poses = slam.trajectory()                                # doctest: +SKIP
     """
@@ -102,11 +102,14 @@ class EdgeSlam:
         depth: DepthFunction | None = None,
         realtime: bool = False,
         executor: Executor | None = None,
+        imu: ImuModel | None = None,
     ) -> None:
         if not isinstance(camera, Camera):
             raise TypeError(f"a Camera is expected, got {type(camera).__name__}: source.camera, or load_camera(FILE)")
         if config is not None and not isinstance(config, SlamConfig):
             raise TypeError(f"a SlamConfig is expected, got {type(config).__name__}")
+        if imu is not None and not isinstance(imu, ImuModel):
+            raise TypeError(f"an ImuModel is expected, got {type(imu).__name__}")
         # One thread each: spinning thread pools slow each other down (docs/decisions/24-threads-and-seeds.md).
         cv2.setNumThreads(1)
         self.camera = camera
@@ -120,7 +123,8 @@ class EdgeSlam:
         self._repeats = RepeatedImages()
         self._calibration_warning: str | None = None
         self._losses: dict[str, float] = {}
-        self._force: SpecificForce | None = None
+        self.imu = imu or ImuModel()
+        self._felt: list[ImuReadings] = []
         self.up: Up | None = None
         """Vertical in the output frame after `finish`: z, unless the axes are those of a loaded map. None if unknown; z
         is then the first camera's up axis."""
@@ -233,23 +237,21 @@ class EdgeSlam:
     def _extract(self, grey: np.ndarray) -> View:
         return make_view(self._orb(grey), self.config.orb.scale_factor)
 
-    def step(
-        self, frame: Frame, telemetry: Sequence[TelemetrySample] = (), prepared: LazyView | None = None
-    ) -> SlamOutput:
+    def step(self, frame: Frame, readings: Sequence[Reading] = (), prepared: LazyView | None = None) -> SlamOutput:
         """Pose of one frame; frames must come in the order of their stamps.
 
         Args:
             frame: Image with the lens distortion still in it, of the camera's size.
-            telemetry: State messages received since the last frame.
+            readings: State messages and IMU readings since the last frame.
             prepared: Result of `prepare`, if it was called.
 
         Raises:
             SourceError: If the image is not of the camera's size, or the stamp does not increase.
-            TypeError, ValueError: If the frame is no `Frame` of a uint8 image, or telemetry no list of
-                `TelemetrySample`; the state is unchanged.
+            TypeError, ValueError: If the frame is no `Frame` of a uint8 image, or the readings are no list of
+                `TelemetrySample` and `ImuReadings`; the state is unchanged.
         """
         check_frame(frame)
-        check_telemetry(telemetry)
+        check_readings(readings)
         if frame.stamp_s <= self._system.motion.stamp_s:
             raise SourceError(f"{frame.name}: stamp {frame.stamp_s} s does not follow {self._system.motion.stamp_s} s")
         system = self._system
@@ -261,6 +263,8 @@ class EdgeSlam:
             seen = prepared if prepared is not None else self.prepare(frame)
             system.shows_nothing_new = self._repeats.repeats(seen.grey, frame.stamp_s)
         with system.timed("fusion"):
+            telemetry, felt = separated(readings)
+            self._felt += felt
             system.fusion.add_telemetry(telemetry)
             system.has_telemetry = system.has_telemetry or len(telemetry) > 0
         if not self.log.records:
@@ -280,7 +284,7 @@ class EdgeSlam:
         self._present = system.fusion.present(frame.stamp_s, str(self.state), system.published, *doubts)
         return self._output(frame, step, joined)
 
-    def pose_now(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> PoseNow | None:
+    def pose_now(self, stamp_s: float, readings: Sequence[Reading] = ()) -> PoseNow | None:
         """Predicted pose at a time after the newest frame; callable from any thread while frames are processed.
 
         With telemetry the video's delay is compensated: the frame stamped ``t`` shows the world at ``t - delay``, and
@@ -288,12 +292,12 @@ class EdgeSlam:
 
         Args:
             stamp_s: Time [s] on the clock of frames and telemetry.
-            telemetry: State messages received since the last call of `step`.
+            readings: State messages and IMU readings since the last call of `step`.
 
         Returns:
             The pose in the world of `SlamOutput.T_w_c`; ``None`` before the first frame with a pose.
         """
-        return self._present.pose_at(stamp_s, telemetry)
+        return self._present.pose_at(stamp_s, separated(readings)[0])
 
     def _step(self, frame: Frame, seen: LazyView) -> Step:
         """Process a frame in the current state."""
@@ -330,10 +334,6 @@ class EdgeSlam:
         self._find_up()
         self._calibration_warning = calibration_warning(self.camera, self._shown_keyframes(), self.map.anchors.p_w)
 
-    def feel(self, force: SpecificForce) -> None:
-        """Set accelerometer readings of the whole recording; they only determine the vertical."""
-        self._force = force
-
     def _find_up(self) -> None:
         """Determine the vertical: from the drone's attitude, with which the world is aligned already; else from
         accelerometer and edges, after which the world is rotated, unless its axes are those of a loaded map."""
@@ -345,7 +345,7 @@ class EdgeSlam:
         by_edges = up_by_edges(shown, self.edges.hosts, self.camera)
         whole = self.support().whole()
         stamps_s, T_w_c = self.log.poses()
-        felt = None if self._force is None else up_by_gravity(self._force, stamps_s[whole], T_w_c[whole])
+        felt = up_by_gravity(ImuReadings.joined(self._felt), self.imu, stamps_s[whole], T_w_c[whole])
         up = best_known(felt, by_edges)
         if up is None:
             return

@@ -6,7 +6,6 @@ integers. Arrays are numpy, float64 for poses and float32 for bulk data, unless 
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
@@ -155,23 +154,6 @@ def check_frame(frame: Frame) -> None:
         raise ValueError(f"{frame.name}: an image is (H, W, 3) BGR or (H, W), got {image.shape}; {remedy}")
     if not math.isfinite(frame.stamp_s):
         raise ValueError(f"{frame.name}: the stamp must be a finite number of seconds, got {frame.stamp_s}")
-
-
-def check_telemetry(telemetry: Sequence[TelemetrySample]) -> None:
-    """Refuse what are no state messages.
-
-    Raises:
-        TypeError: If it is no sequence of `TelemetrySample`.
-        ValueError: If one has a vector of another length than 3.
-    """
-    if not isinstance(telemetry, Sequence):
-        raise TypeError(f"telemetry is a list of TelemetrySample, got {type(telemetry).__name__}")
-    for sample in telemetry:
-        if not isinstance(sample, TelemetrySample):
-            raise TypeError(f"telemetry is a list of TelemetrySample, got a list with {type(sample).__name__}")
-        for name in ("velocity_m_s", "rpy_rad", "acceleration_m_s2"):
-            if not isinstance(value := getattr(sample, name), np.ndarray) or value.shape != (3,):
-                raise ValueError(f"telemetry: {name} is an array of 3 numbers, got {_short(value)}")
 
 
 @dataclass(frozen=True, slots=True, repr=False)

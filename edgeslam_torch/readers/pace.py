@@ -1,11 +1,14 @@
-"""Delivery of frames: with the telemetry received since the last one, or at their original rate."""
+"""Delivery of frames: with the readings received since the last one, or at their original rate."""
 
+import math
 import queue
 import threading
 import time
 from collections.abc import Iterator
+from typing import Protocol
 
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.imu import ImuModel, ImuReadings, Reading
 from edgeslam_torch.types import Frame, TelemetrySample
 
 REALTIME_QUEUE = 15
@@ -15,19 +18,32 @@ Initialisation takes 0.3 s on a PC; tracking takes a third of the frame interval
 """
 
 
-class TelemetryCursor:
-    """Telemetry that arrived since the last frame; the list may grow concurrently."""
+class _WithReadings(Protocol):
+    telemetry: list[TelemetrySample]
+    imu: ImuModel | None
+    imu_readings: ImuReadings | None
 
-    def __init__(self, samples: list[TelemetrySample]) -> None:
-        self._samples = samples
+
+class ReadingsCursor:
+    """Readings of a source since the last frame, each exactly once; the list of telemetry may grow concurrently."""
+
+    def __init__(self, source: _WithReadings) -> None:
+        self._samples, self._imu = source.telemetry, source.imu_readings
+        self._ahead_s = (source.imu.time_offset_s or 0.0) if source.imu is not None else 0.0
         self._next = 0
+        self._until_s = -math.inf
 
-    def until(self, stamp_s: float) -> list[TelemetrySample]:
-        """Samples up to a stamp that were not given before."""
+    def until(self, stamp_s: float) -> list[Reading]:
+        """Readings up to a frame's stamp that were not given before: of an IMU by its own clock."""
         first = self._next
         while self._next < len(self._samples) and self._samples[self._next].stamp_s <= stamp_s:
             self._next += 1
-        return self._samples[first : self._next]
+        given: list[Reading] = [*self._samples[first : self._next]]
+        if self._imu is not None:
+            felt = self._imu.between(self._until_s, stamp_s + self._ahead_s)
+            self._until_s = max(self._until_s, stamp_s + self._ahead_s)
+            given += [felt] if len(felt) else []
+        return given
 
 
 class Steps:
@@ -37,22 +53,26 @@ class Steps:
     kind: str
     camera: Camera
     telemetry: list[TelemetrySample]
+    imu: ImuModel | None = None
+    imu_readings: ImuReadings | None = None
     length: int | None
 
     def frames(self) -> Iterator[Frame]:
         """As `edgeslam_torch.readers.source.Source`."""
         raise NotImplementedError
 
-    def steps(self) -> Iterator[tuple[Frame, list[TelemetrySample]]]:
-        """Each frame with the state messages that arrived since the one before: what `EdgeSlam.step` takes."""
-        cursor = TelemetryCursor(self.telemetry)
+    def steps(self) -> Iterator[tuple[Frame, list[Reading]]]:
+        """Each frame with the state messages and IMU readings since the one before: what `EdgeSlam.step` takes."""
+        cursor = ReadingsCursor(self)
         for frame in self.frames():
             yield frame, cursor.until(frame.stamp_s)
 
     def __repr__(self) -> str:
         long = "frames" if self.length is None else f"at most {self.length} frames"
         size = f"{self.camera.width}x{self.camera.height}"
-        return f"{type(self).__name__}({self.name!r}, {self.kind}, {size}, {long}, {len(self.telemetry)} telemetry)"
+        told = f"{len(self.telemetry)} telemetry"
+        told += "" if self.imu_readings is None else f", {len(self.imu_readings)} IMU readings"
+        return f"{type(self).__name__}({self.name!r}, {self.kind}, {size}, {long}, {told})"
 
 
 class Counter:

@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -10,12 +11,12 @@ from typing import Protocol
 
 from edgeslam_torch.calibration.camera_choice import choose_camera
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.geometry.accelerometer_file import read_specific_force
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.geometry.level import SpecificForce
+from edgeslam_torch.imu import ImuModel, ImuReadings, Reading
 from edgeslam_torch.readers import flight_folder, images, video
 from edgeslam_torch.readers.bags.bag import SUFFIXES, is_bag
 from edgeslam_torch.readers.bags.recording import open_bag
+from edgeslam_torch.readers.imu.find import find_imu
 from edgeslam_torch.readers.layouts import layout_of, read_sequence, tum
 from edgeslam_torch.readers.listing import ImageEntry, Problem
 from edgeslam_torch.readers.pace import Steps
@@ -52,6 +53,10 @@ class Source(Protocol):
     camera: Camera
     telemetry: list[TelemetrySample]
     """Telemetry in time order; grows during a live run."""
+    imu: ImuModel | None
+    """Of the IMU beside the camera; None without one."""
+    imu_readings: ImuReadings | None
+    """Of the whole recording."""
     groundtruth: Path | None
     length: int | None
     """Maximum number of frames; None if unknown."""
@@ -65,8 +70,8 @@ class Source(Protocol):
     def frames(self) -> Iterator[Frame]:
         """Frames in time order."""
 
-    def steps(self) -> Iterator[tuple[Frame, list[TelemetrySample]]]:
-        """Each frame with the telemetry that arrived since the one before."""
+    def steps(self) -> Iterator[tuple[Frame, list[Reading]]]:
+        """Each frame with the readings since the one before."""
 
     def close(self) -> None:
         """Release the device; may be called repeatedly."""
@@ -93,8 +98,8 @@ class Recording(Steps):
     """Number of skipped frames at the start."""
     stride: int = 1
     """Interval of used frames among the others."""
-    force: SpecificForce | None = None
-    """Readings of an accelerometer beside the images."""
+    imu: ImuModel | None = None
+    imu_readings: ImuReadings | None = None
 
     def __post_init__(self) -> None:
         self._listed = tuple(self.problems)
@@ -106,7 +111,7 @@ class Recording(Steps):
         return read_ahead(islice(chosen, self.max_frames))
 
     def part(self, start: int, stride: int) -> "Recording":
-        """Every ``stride``-th frame from number ``start`` on, and no telemetry from before a second ahead of them.
+        """Every ``stride``-th frame from number ``start`` on, and no readings from before a second ahead of them.
 
         Raises:
             SourceError: If there is no frame so late.
@@ -115,7 +120,8 @@ class Recording(Steps):
         if first is None:
             raise SourceError(f"{self.location}: no frame from number {start} on")
         telemetry = [sample for sample in self.telemetry if sample.stamp_s >= first.stamp_s - 1.0]
-        return replace(self, start=start, stride=stride, length=None, telemetry=telemetry)
+        felt = None if self.imu_readings is None else self.imu_readings.between(first.stamp_s - 1.0, math.inf)
+        return replace(self, start=start, stride=stride, length=None, telemetry=telemetry, imu_readings=felt)
 
     def close(self) -> None:
         """Nothing to release."""
@@ -178,7 +184,7 @@ def open_source(
     folders = [path, content.folder] if path.is_dir() else [content.folder]
     telemetry_file = flight_folder.telemetry_file(folders, telemetry)
     samples, remarks = (list(content.telemetry), []) if telemetry_file is None else read_telemetry(telemetry_file)
-    force, felt = read_specific_force(folders)
+    imu, imu_readings, felt = find_imu(folders)
     default = content.default_camera
     chosen, warnings = choose_camera(content.size, camera, folders, default, bool(samples), content.own_camera)
     length = content.length
@@ -196,7 +202,8 @@ def open_source(
         problems=content.problems,
         warnings=[*warnings, *remarks, *felt],
         max_frames=max_frames,
-        force=force,
+        imu=imu,
+        imu_readings=imu_readings,
     )
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.geometry.level import SpecificForce, Up
+from edgeslam_torch.geometry.level import Up
+from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.mapping.level.gravity import best_known, up_by_gravity
 
 UP_M = np.array([0.6, 0.0, 0.8])
@@ -16,7 +17,8 @@ def flight(rng, g=9.81, seconds=4.0, noise=0.5):
     T_m_c = np.tile(np.eye(4), (len(stamps_s), 1, 1))
     T_m_c[:, :3, :3] = Rotation.from_rotvec(np.outer(np.sin(stamps_s), [0.3, 0.5, -0.2])).as_matrix()
     felt_c = np.einsum("nji,j->ni", T_m_c[:, :3, :3], g * UP_M) + noise * rng.normal(size=(len(stamps_s), 3))
-    return SpecificForce(stamps_s, felt_c, math.radians(1.0)), stamps_s, T_m_c
+    felt = ImuReadings(stamps_s, np.zeros_like(felt_c), felt_c)
+    return felt, ImuModel(T_imu_cam=np.eye(4)), stamps_s, T_m_c
 
 
 def test_the_mean_force_gives_the_vertical(rng):
@@ -31,8 +33,13 @@ def test_a_force_other_than_gravity_gives_nothing(rng, kwargs):
 
 
 def test_readings_of_another_time_give_nothing(rng):
-    force, stamps_s, T = flight(rng)
-    assert up_by_gravity(force, stamps_s + 1000.0, T) is None
+    felt, model, stamps_s, T = flight(rng)
+    assert up_by_gravity(felt, model, stamps_s + 1000.0, T) is None
+
+
+def test_without_a_mount_the_vertical_is_unknown(rng):
+    felt, _, stamps_s, T = flight(rng)
+    assert up_by_gravity(felt, ImuModel(), stamps_s, T) is None
 
 
 def test_consistent_verticals_are_fused_and_gravity_wins_a_contradiction():

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from edgeslam_torch.geometry.level import SpecificForce, Up
+from edgeslam_torch.geometry.level import Up
+from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.types import FloatArray
 
 _G_M_S2 = 9.81
@@ -20,33 +21,40 @@ _CONTRADICTION = 3.0
 """Number of sigmas between gravity and edges above which they contradict each other."""
 
 
-def up_by_gravity(force: SpecificForce, stamps_s: FloatArray, T_w_c: FloatArray) -> Up | None:
+_IMU_RAD, _ACCELEROMETER_RAD = math.radians(1.0), math.radians(4.0)
+"""Standard deviation of the mean force's direction: biases of 0.1 m/s^2 and the calibration of the mount; an
+accelerometer alone, as a Kinect's, is not calibrated."""
+
+
+def up_by_gravity(readings: ImuReadings, model: ImuModel, stamps_s: FloatArray, T_w_c: FloatArray) -> Up | None:
     """Vertical of a map from accelerometer readings; None if they do not determine it.
 
     The mean force is the reaction to gravity plus the mean acceleration, the change of velocity over the duration. This
     is unknown without a metric scale; the difference between the two halves serves as its uncertainty.
 
     Args:
-        force: Readings.
+        readings: Readings.
+        model: Mount and clock; without a mount, nothing is determined.
         stamps_s: ``(F,)`` stamps of the poses.
         T_w_c: ``(F, 4, 4)`` poses.
     """
-    if len(stamps_s) < 2:
+    if len(stamps_s) < 2 or model.T_imu_cam is None:
         return None
-    at = np.searchsorted(stamps_s, force.stamps_s).clip(1, len(stamps_s) - 1)
-    at -= force.stamps_s - stamps_s[at - 1] < stamps_s[at] - force.stamps_s
-    near = np.abs(stamps_s[at] - force.stamps_s) < _MAX_GAP_S
-    near &= np.isfinite(force.force_c).all(axis=1)
-    if near.sum() < 10 or float(np.ptp(force.stamps_s[near])) < _MIN_S:
+    felt_s = readings.stamps_s - (model.time_offset_s or 0.0)
+    force_c = readings.acceleration_m_s2 @ model.T_imu_cam[:3, :3]
+    at = np.searchsorted(stamps_s, felt_s).clip(1, len(stamps_s) - 1)
+    at -= felt_s - stamps_s[at - 1] < stamps_s[at] - felt_s
+    near = np.abs(stamps_s[at] - felt_s) < _MAX_GAP_S
+    if near.sum() < 10 or float(np.ptp(felt_s[near])) < _MIN_S:
         return None
-    felt_w = np.einsum("nij,nj->ni", T_w_c[at[near], :3, :3], force.force_c[near])
+    felt_w = np.einsum("nij,nj->ni", T_w_c[at[near], :3, :3], force_c[near])
     mean = felt_w.mean(axis=0)
     g = float(np.linalg.norm(mean))
     if abs(g / _G_M_S2 - 1.0) > _OFF:
         return None
     first, second = (half.mean(axis=0) for half in np.array_split(felt_w, 2))
     spread = float(np.linalg.norm(np.cross(first, second))) / (2.0 * g * g)
-    sigma = math.hypot(force.sigma_rad, spread)
+    sigma = math.hypot(_IMU_RAD if readings.has_gyroscope else _ACCELEROMETER_RAD, spread)
     return Up(mean / g, sigma, "accelerometer") if sigma < _MAX_SIGMA else None
 
 

@@ -1,0 +1,163 @@
+"""Readings and model of an inertial measurement unit (IMU) that is fixed to the camera.
+
+The IMU's axes are its own (``imu``); ``T_imu_cam`` takes camera coordinates to them. Stamps are on the IMU's clock,
+which is ``time_offset_s`` ahead of the images': ``t_imu = t_cam + time_offset_s``.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.types import FloatArray, Record, TelemetrySample
+
+_RIGID = 1e-3
+"""Tolerance of a rotation matrix in a file of four digits."""
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class ImuReadings(Record):
+    """Consecutive readings of an IMU in its own axes; float64.
+
+    An accelerometer without a gyroscope has NaN for every angular rate.
+
+    Raises:
+        ValueError: If shapes differ, stamps do not increase, or numbers are not finite.
+    """
+
+    stamps_s: FloatArray
+    """``(N,)`` on the IMU's clock [s], strictly increasing."""
+    angular_rate_rad_s: FloatArray
+    """``(N, 3)``."""
+    acceleration_m_s2: FloatArray
+    """``(N, 3)`` specific force: at rest +9.81 m/s^2 along the axis that points up."""
+
+    def __post_init__(self) -> None:
+        for name in ("stamps_s", "angular_rate_rad_s", "acceleration_m_s2"):
+            object.__setattr__(self, name, np.array(getattr(self, name), dtype=np.float64))
+        n = len(self.stamps_s) if self.stamps_s.ndim == 1 else -1
+        if self.angular_rate_rad_s.shape != (n, 3) or self.acceleration_m_s2.shape != (n, 3):
+            shapes = self.stamps_s.shape, self.angular_rate_rad_s.shape, self.acceleration_m_s2.shape
+            raise ValueError(f"IMU readings are (N,), (N, 3), (N, 3), got {', '.join(map(str, shapes))}")
+        if not np.isfinite(self.stamps_s).all() or not (self.stamps_s[1:] > self.stamps_s[:-1]).all():
+            raise ValueError("stamps of IMU readings are finite and strictly increasing")
+        if not np.isfinite(self.acceleration_m_s2).all():
+            raise ValueError("accelerations of IMU readings are finite")
+        if self.has_gyroscope and not np.isfinite(self.angular_rate_rad_s).all():
+            raise ValueError("angular rates of IMU readings are finite, or all NaN without a gyroscope")
+
+    def __len__(self) -> int:
+        return len(self.stamps_s)
+
+    @property
+    def has_gyroscope(self) -> bool:
+        """Whether there are angular rates."""
+        return not np.isnan(self.angular_rate_rad_s).all()
+
+    @property
+    def rate_hz(self) -> float:
+        """By the median interval; NaN for fewer than two."""
+        return 1.0 / float(np.median(np.diff(self.stamps_s))) if len(self) > 1 else math.nan
+
+    def between(self, after_s: float, until_s: float) -> "ImuReadings":
+        """Readings with ``after_s < stamp <= until_s``."""
+        first, end = np.searchsorted(self.stamps_s, (after_s, until_s), side="right")
+        return self._rows(slice(first, max(first, end)))
+
+    def _rows(self, rows: slice) -> "ImuReadings":
+        return ImuReadings(self.stamps_s[rows], self.angular_rate_rad_s[rows], self.acceleration_m_s2[rows])
+
+    @classmethod
+    def joined(cls, parts: Iterable["ImuReadings"]) -> "ImuReadings":
+        """All readings of parts that follow each other; of doubled and reversed stamps the later readings are left
+        out."""
+        parts = [part for part in parts if len(part)]
+        if not parts:
+            return cls(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+        stamps_s = np.concatenate([part.stamps_s for part in parts])
+        newest_s = np.concatenate([[-np.inf], np.maximum.accumulate(stamps_s)[:-1]])
+        kept = stamps_s > newest_s
+        return cls(
+            stamps_s[kept],
+            np.concatenate([part.angular_rate_rad_s for part in parts])[kept],
+            np.concatenate([part.acceleration_m_s2 for part in parts])[kept],
+        )
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class ImuModel(Record):
+    """Noise of an IMU, and its mount and clock beside the camera's. None: unknown, to be estimated.
+
+    The default noise is that of a cheap one (InvenSense MPU-6050): its data sheet's densities, 0.005 deg/s/sqrt(Hz) and
+    400 ug/sqrt(Hz), times five and two for vibration, and bias walks of 0.04 deg/s and 0.04 m/s^2 in a minute.
+
+    Raises:
+        ValueError: If a number is not positive, or the mount is no rigid transform.
+    """
+
+    gyroscope_noise_density: float = 4.4e-4
+    """[rad/s/sqrt(Hz)]"""
+    gyroscope_random_walk: float = 1e-4
+    """[rad/s^2/sqrt(Hz)]"""
+    accelerometer_noise_density: float = 8e-3
+    """[m/s^2/sqrt(Hz)]"""
+    accelerometer_random_walk: float = 5e-3
+    """[m/s^3/sqrt(Hz)]"""
+    rate_hz: float = 200.0
+    T_imu_cam: FloatArray | None = None
+    """``(4, 4)`` camera to IMU [m]."""
+    time_offset_s: float | None = None
+    """``t_imu = t_cam + time_offset_s``."""
+    source: str = "assumed noise of a cheap IMU"
+    """Where the numbers come from, for messages."""
+
+    def __post_init__(self) -> None:
+        for name in (
+            "gyroscope_noise_density",
+            "gyroscope_random_walk",
+            "accelerometer_noise_density",
+            "accelerometer_random_walk",
+            "rate_hz",
+        ):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} of an IMU is a positive number, got {getattr(self, name)}")
+        if self.time_offset_s is not None and not math.isfinite(self.time_offset_s):
+            raise ValueError(f"time_offset_s of an IMU is a finite number or None, got {self.time_offset_s}")
+        if self.T_imu_cam is not None:
+            T = np.array(self.T_imu_cam, dtype=np.float64)
+            object.__setattr__(self, "T_imu_cam", T)
+            whole = T.shape == (4, 4) and np.isfinite(T).all() and T[3].tolist() == [0, 0, 0, 1]
+            R = T[:3, :3] if whole else np.zeros((3, 3))
+            if not np.allclose(R @ R.T, np.eye(3), atol=_RIGID) or np.linalg.det(R) < 0:
+                raise ValueError("T_imu_cam is no rotation and translation, camera to IMU")
+
+
+Reading = TelemetrySample | ImuReadings
+"""What `EdgeSlam.step` takes beside a frame."""
+
+
+def check_readings(readings: Sequence[Reading]) -> None:
+    """Refuse what are no state messages or IMU readings.
+
+    Raises:
+        TypeError: If it is no sequence of `TelemetrySample` and `ImuReadings`.
+        ValueError: If a state message has a vector of another length than 3.
+    """
+    if not isinstance(readings, Sequence):
+        raise TypeError(f"readings are a list of TelemetrySample and ImuReadings, got {type(readings).__name__}")
+    for reading in readings:
+        if isinstance(reading, ImuReadings):
+            continue
+        if not isinstance(reading, TelemetrySample):
+            kind = type(reading).__name__
+            raise TypeError(f"readings are a list of TelemetrySample and ImuReadings, got a list with {kind}")
+        for name in ("velocity_m_s", "rpy_rad", "acceleration_m_s2"):
+            if not isinstance(value := getattr(reading, name), np.ndarray) or value.shape != (3,):
+                raise ValueError(f"telemetry: {name} is an array of 3 numbers, got {np.shape(value)}")
+
+
+def separated(readings: Sequence[Reading]) -> tuple[list[TelemetrySample], list[ImuReadings]]:
+    """State messages and IMU readings, each in their order."""
+    telemetry = [reading for reading in readings if isinstance(reading, TelemetrySample)]
+    return telemetry, [reading for reading in readings if isinstance(reading, ImuReadings)]
