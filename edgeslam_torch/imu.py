@@ -63,9 +63,7 @@ class ImuReadings(Record):
     def between(self, after_s: float, until_s: float) -> "ImuReadings":
         """Readings with ``after_s < stamp <= until_s``."""
         first, end = np.searchsorted(self.stamps_s, (after_s, until_s), side="right")
-        return self._rows(slice(first, max(first, end)))
-
-    def _rows(self, rows: slice) -> "ImuReadings":
+        rows = slice(first, max(first, end))
         return ImuReadings(self.stamps_s[rows], self.angular_rate_rad_s[rows], self.acceleration_m_s2[rows])
 
     @classmethod
@@ -83,6 +81,11 @@ class ImuReadings(Record):
             np.concatenate([part.angular_rate_rad_s for part in parts])[kept],
             np.concatenate([part.acceleration_m_s2 for part in parts])[kept],
         )
+
+
+_SENSORS, _NOISES = ("gyroscope", "accelerometer"), ("noise_density", "random_walk")
+MODEL_NUMBERS = (*(f"{sensor}_{noise}" for sensor in _SENSORS for noise in _NOISES), "rate_hz")
+"""Fields of `ImuModel` that are positive numbers."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -113,13 +116,7 @@ class ImuModel(Record):
     """Where the numbers come from, for messages."""
 
     def __post_init__(self) -> None:
-        for name in (
-            "gyroscope_noise_density",
-            "gyroscope_random_walk",
-            "accelerometer_noise_density",
-            "accelerometer_random_walk",
-            "rate_hz",
-        ):
+        for name in MODEL_NUMBERS:
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} of an IMU is a positive number, got {getattr(self, name)}")
         if self.time_offset_s is not None and not math.isfinite(self.time_offset_s):
@@ -150,8 +147,7 @@ def check_readings(readings: Sequence[Reading]) -> None:
         if isinstance(reading, ImuReadings):
             continue
         if not isinstance(reading, TelemetrySample):
-            kind = type(reading).__name__
-            raise TypeError(f"readings are a list of TelemetrySample and ImuReadings, got a list with {kind}")
+            raise TypeError(f"readings: a TelemetrySample or ImuReadings is expected, got {type(reading).__name__}")
         for name in ("velocity_m_s", "rpy_rad", "acceleration_m_s2"):
             if not isinstance(value := getattr(reading, name), np.ndarray) or value.shape != (3,):
                 raise ValueError(f"telemetry: {name} is an array of 3 numbers, got {np.shape(value)}")
@@ -159,5 +155,4 @@ def check_readings(readings: Sequence[Reading]) -> None:
 
 def separated(readings: Sequence[Reading]) -> tuple[list[TelemetrySample], list[ImuReadings]]:
     """State messages and IMU readings, each in their order."""
-    telemetry = [reading for reading in readings if isinstance(reading, TelemetrySample)]
-    return telemetry, [reading for reading in readings if isinstance(reading, ImuReadings)]
+    return [r for r in readings if isinstance(r, TelemetrySample)], [r for r in readings if isinstance(r, ImuReadings)]

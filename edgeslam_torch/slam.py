@@ -108,7 +108,8 @@ class EdgeSlam:
             raise TypeError(f"a Camera is expected, got {type(camera).__name__}: source.camera, or load_camera(FILE)")
         if config is not None and not isinstance(config, SlamConfig):
             raise TypeError(f"a SlamConfig is expected, got {type(config).__name__}")
-        if imu is not None and not isinstance(imu, ImuModel):
+        self.imu = ImuModel() if imu is None else imu
+        if not isinstance(self.imu, ImuModel):
             raise TypeError(f"an ImuModel is expected, got {type(imu).__name__}")
         # One thread each: spinning thread pools slow each other down (docs/decisions/24-threads-and-seeds.md).
         cv2.setNumThreads(1)
@@ -123,7 +124,6 @@ class EdgeSlam:
         self._repeats = RepeatedImages()
         self._calibration_warning: str | None = None
         self._losses: dict[str, float] = {}
-        self.imu = imu or ImuModel()
         self._felt: list[ImuReadings] = []
         self.up: Up | None = None
         """Vertical in the output frame after `finish`: z, unless the axes are those of a loaded map. None if unknown; z
