@@ -9,7 +9,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import pytest
 from browser import PROGRAM, Browser
@@ -167,18 +167,6 @@ def test_formulas_of_a_page_are_set() -> None:
     assert found.count("<math") == 1 and "```math" not in found and "```\nmath\n```" in found
 
 
-def test_example_becomes_a_section_that_is_set_as_code() -> None:
-    thing = SimpleNamespace(docstring=SimpleNamespace(value="Double.\n\nExample:\n    >>> 2 * 2\n    4\n"))
-    formulas.Formulas().on_object(obj=thing)
-    assert "\nExamples:\n    >>>" in thing.docstring.value
-
-
-def test_search_prefers_guides() -> None:
-    order = ("guides/tello.md", "theory/scale.md", "reference/api/slam.md", "decisions/0001-x.md")
-    weights = [hooks.boost(page) for page in order]
-    assert weights == sorted(set(weights), reverse=True)
-
-
 def test_formula_that_cannot_be_set_is_an_error() -> None:
     with pytest.raises(ValueError, match=r"does not know: \\nosuch"):
         formulas.mathml(r"\nosuch{x}", "inline")
@@ -217,10 +205,3 @@ def test_notebook_becomes_a_page(tmp_path: Path) -> None:
     )
     text = load("notebook_page").notebook_page(path)
     assert text.startswith("# Title\nwords\n\n```python\n1 + 1\n```\n\n```text\n2\n```\n\n```text\nsaid\n```\n")
-
-
-def test_every_decision_record_is_in_the_index() -> None:
-    records = ROOT / "docs" / "decisions"
-    index = (records / "README.md").read_text(encoding="utf-8")
-    missing = [path.name for path in sorted(records.glob("[0-9]*.md")) if f"({path.name})" not in index]
-    assert not missing

@@ -75,17 +75,6 @@ def test_what_is_no_camera_is_refused_at_once():
         EdgeSlam({"fx": 500.0})
 
 
-def test_records_are_shown_by_shapes():
-    slam = EdgeSlam(CAMERA, NO_NETWORK)
-    output = slam.step(BGR)
-    assert "image=<48x64x3 uint8>" in repr(BGR)
-    assert "T_w_c=<4x4 float64>" in repr(output) and "status=" in repr(output)
-    assert "velocity_m_s=[1, 2, 3]" in repr(TelemetrySample(0.0, np.array([1.0, 2.0, 3.0])))
-    assert "1 frames" in repr(slam) and "64x48" in repr(slam)
-    shown = [BGR, output, slam, slam.edge_map(), slam.anchors(), slam.support(), slam.observations(), CAMERA]
-    assert max(len(repr(record)) for record in shown) < 1200
-
-
 def test_steps_pair_each_frame_with_the_telemetry_since_the_last(tmp_path, write_images):
     write_images(tmp_path, [f"{k}.png" for k in range(4)])
     save_camera(tmp_path / "camera.yaml", CAMERA)

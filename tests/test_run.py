@@ -1,7 +1,6 @@
 """The run loop around a SLAM system that knows the answer."""
 
 import csv
-import gc
 import json
 import os
 import signal
@@ -23,7 +22,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.pace import Counter, at_their_pace
 from edgeslam_torch.readers.source import open_source
-from edgeslam_torch.run import AtlasFiles, Mode, _load_slam, run
+from edgeslam_torch.run import AtlasFiles, Mode, run
 from edgeslam_torch.types import Frame, TelemetrySample
 from edgeslam_torch.writers import run_summary
 from edgeslam_torch.writers.ply import read_ply
@@ -373,15 +372,6 @@ def test_realtime_drops_nothing_when_there_is_time(tmp_path, write_tum):
     assert result.summary["dropped_frames"] == 0
     assert result.summary["frames"] == 3
     assert result.summary["duration_s"] > 0.19
-
-
-def test_loading_the_system_leaves_the_collector_as_it_was():
-    try:
-        _load_slam()
-        assert gc.isenabled()
-        assert gc.get_freeze_count() > 1000
-    finally:
-        gc.unfreeze()
 
 
 def test_an_atlas_that_could_not_be_written_is_not_said_to_be_saved(tmp_path, write_tum, monkeypatch):

@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-import edgeslam_torch
-
 ROOT = Path(__file__).resolve().parent.parent
 PUBLIC = ("edgeslam_torch", "edgeslam_torch.losses", "edgeslam_torch.models", "edgeslam_torch.train")
 WITHOUT_SAYING = re.compile(r"numpy\.ndarray\[[^()]*?\]\]+|dict\[str, Any\]")
@@ -58,28 +56,6 @@ def test_every_public_name_is_listed_and_there(package):
     assert [name for name in module.__all__ if not hasattr(module, name)] == []
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         module.nothing  # noqa: B018
-
-
-def test_names_are_not_hidden_by_modules_of_the_same_name():
-    """A module that is imported becomes an attribute of its package: whoever asks for the name would get the module."""
-    for package in PUBLIC:
-        module = importlib.import_module(package)
-        homes = {path.stem for folder in module.__path__ for path in Path(folder).iterdir()}
-        same = homes & set(module.__all__)
-        assert all(callable(getattr(module, name)) for name in same)
-        assert same <= {"run"}  # a module that can be called
-
-
-def test_editors_are_told_of_the_names_that_load_on_first_use():
-    stub = (Path(edgeslam_torch.__file__).parent / "__init__.pyi").read_text()
-    listed = re.findall(r'^    "(\w+)",$', stub, re.MULTILINE)
-    imported = re.findall(r"^from .* import (\w+) as \1$", stub, re.MULTILINE)
-    assert listed == edgeslam_torch.__all__
-    assert {*imported, "__version__"} == set(listed)
-
-
-def test_type_checkers_are_told_that_there_are_types():
-    assert (Path(edgeslam_torch.__file__).parent / "py.typed").is_file()
 
 
 def questions() -> Iterator[str]:
