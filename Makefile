@@ -54,7 +54,7 @@ SAMPLE ?= 100
 TESTS ?= tests
 DRAW = shuf --random-source=<(yes $(SEED)) -n
 MODULES ?= $(shell find -L edgeslam_torch -name '*.py' -size +1k | sort | $(DRAW) 10)
-MUTMUT := OMP_NUM_THREADS=1 ../../$(BIN)/mutmut
+MUTMUT := OMP_NUM_THREADS=1 $(abspath $(BIN))/python -m mutmut
 mutation: $(STAMP)
 	rm -rf runs/mutation && mkdir -p runs/mutation
 	cp -rL edgeslam_torch tests docs examples *.md *.txt CITATION.cff Makefile pyproject.toml runs/mutation
