@@ -63,7 +63,7 @@ mutation: $(STAMP)
 		runs/mutation/pyproject.toml
 	cd runs/mutation && $(MUTMUT) run 'none.*' > mutmut.log; true
 	cd runs/mutation && $(MUTMUT) results --all true | sed 's/^ *//; s/: .*//' | sort | $(DRAW) $(SAMPLE) | xargs $(MUTMUT) run > mutmut.log
-	cd runs/mutation && $(MUTMUT) results | sed -n 's/: \(survived\|no tests\)$$//p' | xargs -n 1 $(MUTMUT) show > survivors.txt
+	cd runs/mutation && $(MUTMUT) results | sed -n 's/: \(survived\|no tests\)$$//p' | xargs -r -n 1 $(MUTMUT) show > survivors.txt
 	@tail -n 3 runs/mutation/mutmut.log; grep -c '^# ' runs/mutation/survivors.txt; echo "survivors: runs/mutation/survivors.txt"
 
 lint: $(STAMP)
