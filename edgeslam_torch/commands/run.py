@@ -40,6 +40,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--telemetry", type=Path, metavar="FILE", help="telemetry.csv of the flight (default: SOURCE's own)"
     )
     parser.add_argument(
+        "--imu", type=Path, metavar="FILE", help="readings of the IMU, CSV (default: SOURCE's own, such as imu.csv)"
+    )
+    parser.add_argument("--no-imu", action="store_const", dest="imu", const="none", help="use no IMU")
+    parser.add_argument(
+        "--imu-model",
+        type=Path,
+        metavar="FILE",
+        help="its noise, mount and clock: imu.yaml, Kalibr's, ORB-SLAM3's (default: beside it)",
+    )
+    parser.add_argument(
         "--topic",
         action="append",
         default=[],
@@ -179,7 +189,9 @@ def _source(args: argparse.Namespace) -> "Source":
         raise ConfigError(f"{args.source}: --start and --stride are for recordings")
     if args.record is not None:
         return _recorded(args)
-    source = open_source(args.source, args.camera, args.telemetry, args.max_frames, args.topic)
+    source = open_source(
+        args.source, args.camera, args.telemetry, args.max_frames, args.topic, args.imu, args.imu_model
+    )
     return source if whole or not isinstance(source, Recording) else source.part(args.start, args.stride)
 
 

@@ -16,7 +16,7 @@ from edgeslam_torch.imu import ImuModel, ImuReadings, Reading
 from edgeslam_torch.readers import flight_folder, images, video
 from edgeslam_torch.readers.bags.bag import SUFFIXES, is_bag
 from edgeslam_torch.readers.bags.recording import open_bag
-from edgeslam_torch.readers.imu.find import find_imu
+from edgeslam_torch.readers.imu.find import NONE, Given, Imu, find_imu
 from edgeslam_torch.readers.layouts import layout_of, read_sequence, tum
 from edgeslam_torch.readers.listing import ImageEntry, Problem
 from edgeslam_torch.readers.pace import Steps
@@ -143,6 +143,17 @@ class _Content:
     """Calibration inside the recording."""
     telemetry: tuple[TelemetrySample, ...] = ()
     """Telemetry inside the recording."""
+    imu: Callable[[], tuple[ImuReadings | None, list[str]]] = lambda: (None, [])
+    """Readings of an IMU inside the recording, and remarks."""
+    stamps_s: tuple[float, float] | None = None
+    """Of the first and the last frame, if known without decoding."""
+
+    def span_s(self) -> tuple[float, float]:
+        """Stamps of the first and the last frame; of a video, infinity in place of the last."""
+        if self.stamps_s is not None:
+            return self.stamps_s
+        first = next(self.decode(self.size, []), None)
+        return (0.0 if first is None else first.stamp_s), math.inf
 
 
 def open_source(
@@ -151,6 +162,8 @@ def open_source(
     telemetry: str | Path | None = None,
     max_frames: int | None = None,
     topics: Sequence[str] = (),
+    imu: str | Path | None = None,
+    imu_model: str | Path | None = None,
 ) -> Source:
     """Open the source that ``spec`` names.
 
@@ -161,6 +174,8 @@ def open_source(
         telemetry: ``telemetry.csv`` of the flight; default: the source's own.
         max_frames: Maximum number of frames.
         topics: Of a ROS bag, see `edgeslam_torch.readers.bags.topics.choose`.
+        imu: Readings of an IMU, or ``none``; default: the source's own.
+        imu_model: Its noise, mount and clock; default: the files beside the readings and the calibration.
 
     Raises:
         SourceError: If there is nothing usable; the message names the file and what to do.
@@ -172,6 +187,8 @@ def open_source(
     if str(spec).startswith(LIVE_SCHEMES):
         if topics:
             raise SourceError(f"{spec}: --topic is for ROS bags ({', '.join(SUFFIXES)})")
+        if imu not in (None, NONE) or imu_model is not None:
+            raise SourceError(f"{spec}: an IMU's file is for recordings; give step() its readings in Python")
         return _open_live(str(spec), camera, telemetry, max_frames)
     path = Path(spec).expanduser()
     if path.exists() and is_bag(path):
@@ -184,7 +201,7 @@ def open_source(
     folders = [path, content.folder] if path.is_dir() else [content.folder]
     telemetry_file = flight_folder.telemetry_file(folders, telemetry)
     samples, remarks = (list(content.telemetry), []) if telemetry_file is None else read_telemetry(telemetry_file)
-    imu, imu_readings, felt = find_imu(folders)
+    model, readings, felt = _imu_of(content, folders, imu, imu_model, camera)
     default = content.default_camera
     chosen, warnings = choose_camera(content.size, camera, folders, default, bool(samples), content.own_camera)
     length = content.length
@@ -202,9 +219,37 @@ def open_source(
         problems=content.problems,
         warnings=[*warnings, *remarks, *felt],
         max_frames=max_frames,
-        imu=imu,
-        imu_readings=imu_readings,
+        imu=model,
+        imu_readings=readings,
     )
+
+
+def _imu_of(
+    content: _Content,
+    folders: Sequence[Path],
+    imu: str | Path | None,
+    imu_model: str | Path | None,
+    camera: str | Path | None,
+) -> Imu:
+    """The IMU that was named, else the recording's own."""
+    if imu == NONE:
+        return None, None, []
+    inside, said = content.imu() if imu is None else (None, [])
+    given = Given(_file(imu, "--imu"), _file(imu_model, "--imu-model"), None if camera is None else Path(camera))
+    model, readings, remarks = find_imu(folders, given, content.span_s, inside)
+    return model, readings, [*said, *remarks]
+
+
+def _file(given: str | Path | None, option: str) -> Path | None:
+    """A file that the user named.
+
+    Raises:
+        SourceError: If it does not exist.
+    """
+    path = None if given is None else Path(given).expanduser()
+    if path is not None and not path.is_file():
+        raise SourceError(f"{option} {path}: no such file")
+    return path
 
 
 def frames_without_camera(path: Path, problems: list[Problem]) -> Iterator[Frame]:
@@ -255,6 +300,7 @@ def _bag_content(path: Path, topics: Sequence[str], calibrated: bool) -> _Conten
         path if path.is_dir() else path.parent,
         own_camera=bag.camera,
         telemetry=tuple(bag.telemetry),
+        imu=bag.imu,
     )
 
 
@@ -302,6 +348,7 @@ def _listed(sequence: ImageSequence, place: Path) -> _Content:
         sequence.folder,
         sequence.groundtruth,
         sequence.camera,
+        stamps_s=(sequence.images[0].stamp_s, sequence.images[-1].stamp_s),
     )
 
 

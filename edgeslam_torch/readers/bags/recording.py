@@ -1,9 +1,10 @@
 """A bag as a recording: pictures with stamps, calibration, telemetry."""
 
+import copy
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,11 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.imu import ImuReadings
 from edgeslam_torch.readers.bags.bag import Bag
 from edgeslam_torch.readers.bags.camera_info import camera_from_info
 from edgeslam_torch.readers.bags.clock import Offset, TopicClock, disagree, header_s, measure
+from edgeslam_torch.readers.bags.imu import read_bag_imu
 from edgeslam_torch.readers.bags.pictures import PictureDecoder
 from edgeslam_torch.readers.bags.telemetry import read_bag_telemetry
 from edgeslam_torch.readers.bags.topics import Choice, choose
@@ -45,6 +48,12 @@ class BagRecording:
     """Of the pictures' header stamps."""
     levels: Levels | None
     """Of pictures of more than eight bits."""
+    clocks: Mapping[str, TopicClock] = field(default_factory=dict)
+    """Of the IMU's topics."""
+
+    def imu(self) -> tuple[ImuReadings | None, list[str]]:
+        """Readings of the IMU, None without one; and remarks."""
+        return read_bag_imu(self.bag, self.choice.imu, copy.deepcopy(self.clocks))
 
     def frames(self, problems: list[Problem]) -> Iterator[Frame]:
         """Pictures with increasing stamps, read a chunk of the file at a time; skipped ones go to ``problems``."""
@@ -96,11 +105,12 @@ def open_bag(path: Path, topics: Sequence[str] = (), calibrated: bool = False) -
     if levels is not None:
         remarks.append(f"{choice.image}: more than 8 bits: {levels.words}")
     offset, clocks = _clocks(bag, choice, remarks)
+    of_imu = {name: copy.copy(clocks[name]) for name in choice.imu}
     telemetry, said = read_bag_telemetry(bag, choice.telemetry, choice.asked, clocks)
     for name, clock in clocks.items():
         if clock.mended:
             remarks.append(f"{name}: {clock.mended} header stamps jump; the times between receipts were used for them")
-    return BagRecording(bag, choice, size, count, camera, telemetry, (*remarks, *said), offset, levels)
+    return BagRecording(bag, choice, size, count, camera, telemetry, (*remarks, *said), offset, levels, of_imu)
 
 
 def _camera(bag: Bag, choice: Choice, remarks: list[str]) -> Camera | None:
@@ -144,7 +154,7 @@ def _clocks(bag: Bag, choice: Choice, remarks: list[str]) -> tuple[Offset, dict[
     """The pictures' clock, and one clock a telemetry topic on the same time."""
     offsets = {
         name: measure([(raw.received_s, header_s(message)) for raw, message in bag.first(name, _LOOKED_AT)])
-        for name in (choice.image, *choice.telemetry.values())
+        for name in {choice.image, *choice.telemetry.values(), *choice.imu}
     }
     of_image = offsets[choice.image]
     if of_image.fault is not None:
@@ -155,7 +165,7 @@ def _clocks(bag: Bag, choice: Choice, remarks: list[str]) -> tuple[Offset, dict[
             "they are used as they are"
         )
     clocks = {}
-    for name in choice.telemetry.values():
+    for name in dict.fromkeys((*choice.telemetry.values(), *choice.imu)):
         offset = offsets[name]
         fault = offset.fault
         if fault is None and disagree(offset, of_image):

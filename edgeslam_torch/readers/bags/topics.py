@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.bags.bag import Bag, Topic
+from edgeslam_torch.readers.bags.imu import choose_imu
 from edgeslam_torch.readers.bags.pictures import THERMAL, depth_format
 
 IMAGE, CAMERA = "image", "camera"
@@ -41,6 +42,8 @@ class Choice:
     asked: frozenset[str] = frozenset()
     """Roles that were named by ``--topic``."""
     remarks: tuple[str, ...] = ()
+    imu: tuple[str, ...] = ()
+    """Topics of the IMU beside the camera, see `edgeslam_torch.readers.bags.imu.choose_imu`."""
 
 
 def role_of(topic: Topic) -> str | None:
@@ -78,7 +81,12 @@ def choose(bag: Bag, wanted: Sequence[str] = ()) -> Choice:
         remarks.append(
             f"{image}: {THERMAL} is read as 16-bit pictures, since the topic was named; depth maps have the same format"
         )
-    return Choice(image, _camera(bag, image, requests.get(CAMERA)), telemetry, asked, tuple(remarks))
+    imus = [topic for topic in bag.topics if role_of(topic) == "imu" and topic.count]
+    if (named := requests.get("imu")) is not None:
+        imus = [topic for topic in imus if topic.name == named]
+    imu, said = choose_imu(imus, image)
+    remarks += [] if said is None else [said]
+    return Choice(image, _camera(bag, image, requests.get(CAMERA)), telemetry, asked, tuple(remarks), imu)
 
 
 def _requests(bag: Bag, wanted: Sequence[str]) -> dict[str, str]:

@@ -1,65 +1,132 @@
-"""IMUs beside a recording's images: ``imu.csv`` with ``imu.yaml``, ``accelerometer.txt`` of TUM RGB-D."""
+"""The IMU of a recording: given files, ``imu.csv`` in its folder, EuRoC's ``imu0``, TUM RGB-D's accelerometer."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from edgeslam_torch.errors import EdgeSlamError, SourceError
-from edgeslam_torch.files.record_files import read_mapping
-from edgeslam_torch.files.tables import read_table
-from edgeslam_torch.files.time_units import UNKNOWN, seconds_of
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera_file import camera_keys
 from edgeslam_torch.imu import ImuModel, ImuReadings
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.readers.imu.model import matrix, read_model
+from edgeslam_torch.readers.imu.table import read_readings
 
-KINECT, READINGS, MODEL = "accelerometer.txt", "imu.csv", "imu.yaml"
-_GAPS_S = (1e-4, 1.0)
-"""Time between readings: 10 kHz to 1 Hz."""
+NONE = "none"
+"""Given in place of a file: no IMU is used."""
+READINGS, EUROC, KINECT = "imu.csv", Path("imu0", "data.csv"), "accelerometer.txt"
 _T_KINECT_CAM = np.diag([-1.0, -1.0, 1.0, 1.0])
 """The Kinect's accelerometer has x left, y up, z forward (https://cvg.cit.tum.de/data/datasets/rgbd-dataset)."""
-
-Found = tuple[ImuModel | None, ImuReadings | None, list[str]]
-
-
-def find_imu(folders: Sequence[Path]) -> Found:
-    """Model and readings of the IMU in the first folder that has one, and warnings. An unreadable file causes a
-    warning, not an error, because the images alone make a run."""
-    for folder in folders:
-        try:
-            if (folder / READINGS).is_file():
-                return _imu(folder)
-            if (folder / KINECT).is_file():
-                stamps_s, values = _table(folder / KINECT, (0, 1, 2, 3))
-                felt = ImuReadings(stamps_s, np.full_like(values, np.nan), values)
-                return ImuModel(T_imu_cam=_T_KINECT_CAM, time_offset_s=0.0, source=KINECT), felt, []
-        except EdgeSlamError as error:
-            return None, None, [f"an IMU is not used: {error}"]
-    return None, None, []
+_MISSING_S = 0.5
+"""Time without readings at either end of a recording that is worth a remark."""
+_LONGEST_S = 3600.0
+"""Time by which the readings of a video of unknown length begin."""
 
 
-def _imu(folder: Path) -> Found:
-    stamps_s, values = _table(folder / READINGS, range(7))
-    readings = ImuReadings(stamps_s, values[:, :3], values[:, 3:])
-    if not (folder / MODEL).is_file():
-        model = ImuModel()
-        return model, readings, [f"{folder / READINGS}: no {MODEL} beside it; {model.source}, mount and clock unknown"]
-    record = read_mapping(folder / MODEL, "YAML", SourceError)
-    names = ("gyroscope_noise_density", "gyroscope_random_walk", "accelerometer_noise_density")
-    names += ("accelerometer_random_walk", "rate_hz", "T_imu_cam", "time_offset_s")
+Imu = tuple[ImuModel | None, ImuReadings | None, list[str]]
+"""Model and readings, None without an IMU, and remarks for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """Files from the command line."""
+
+    readings: Path | None = None
+    model: Path | None = None
+    camera: Path | None = None
+    """Calibration, which may hold the IMU's numbers, too: ORB-SLAM3's, Kalibr's."""
+
+
+def find_imu(
+    folders: Sequence[Path], given: Given, span: Callable[[], tuple[float, float]], inside: ImuReadings | None = None
+) -> Imu:
+    """The IMU of a recording; none, with a warning, if the files found beside it are unusable: the images alone make a
+    run.
+
+    Args:
+        folders: Where to look: the recording's, and that of its images.
+        given: Files that the user named.
+        span: Stamps of the first and the last frame [s]; the last may be infinite.
+        inside: Readings in the recording itself, a bag.
+
+    Raises:
+        SourceError, CalibrationError: If a given file does not exist or is unusable.
+    """
+    path = given.readings
+    if path is None and inside is None:
+        candidates = [place / name for folder in folders for place, name in _places(folder)]
+        path = next((candidate for candidate in candidates if candidate.is_file()), None)
+    if path is None and inside is None:
+        if given.model is not None:
+            raise SourceError(f"{given.model}: --imu-model describes an IMU, and there are no readings of one")
+        return None, None, []
     try:
-        given = {name: record[name] for name in names if name in record}
-        return ImuModel(**given, source=MODEL), readings, []
-    except (TypeError, ValueError) as error:
-        raise SourceError(f"{folder / MODEL}: {error}") from error
+        model, readings, remarks = _read(path, inside, [*([path.parent] if path is not None else []), *folders], given)
+        return model, readings, [*remarks, *_coverage(model, readings, *span())]
+    except EdgeSlamError as error:
+        if given.readings is not None or given.model is not None:
+            raise
+        return None, None, [f"the IMU is not used: {error}"]
 
 
-def _table(path: Path, columns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-    """Stamps [s] and finite values in time order."""
-    values = read_table(path, SourceError).numbers(columns)
-    values = values[np.isfinite(values).all(axis=1)]
-    stamps_s, unit = seconds_of(values[:, 0], _GAPS_S)
-    if len(values) < 2 or unit == UNKNOWN or not math.isfinite(stamps_s[0]):
-        raise SourceError(f"{path}: needs stamps and readings of an IMU in time order")
-    stamps_s, first = np.unique(stamps_s, return_index=True)
-    return stamps_s, values[first, 1:]
+def _places(folder: Path) -> list[tuple[Path, str | Path]]:
+    """Folders and files in them that may hold readings, for a recording's folder or EuRoC's ``cam0`` in it."""
+    return [(folder, READINGS), (folder / "mav0", EUROC), (folder.parent, EUROC), (folder, KINECT)]
+
+
+def _read(
+    path: Path | None, inside: ImuReadings | None, folders: Sequence[Path], given: Given
+) -> tuple[ImuModel, ImuReadings, list[str]]:
+    if path is not None and path.name == KINECT:
+        readings, remarks = read_readings(path)
+        model = ImuModel(rate_hz=readings.rate_hz, T_imu_cam=_T_KINECT_CAM, time_offset_s=0.0, source=KINECT)
+        return model, readings, remarks
+    readings, remarks = (inside, []) if path is None else read_readings(path)
+    assert readings is not None
+    files = [given.model] if given.model is not None else _models(folders)
+    files += [given.camera] if given.camera is not None and given.camera.is_file() else []
+    is_euroc = path is not None and path.parent.name == EUROC.parent.name
+    by_poses = _by_poses(path.parent, folders) if path is not None and is_euroc else {}
+    model, assumed = read_model(list(dict.fromkeys(files)), readings.rate_hz, by_poses)
+    return model, readings, [*remarks, *assumed]
+
+
+def _models(folders: Sequence[Path]) -> list[Path]:
+    """Files of these folders that may describe an IMU: ours, Kalibr's, OpenVINS's, and TUM-VI's in ``dso``."""
+    places = [place for folder in folders for place in (folder, folder / "dso", folder.parent / "dso")]
+    patterns = ("*imu*.y*ml", "sensor.yaml", "cam*.y*ml")
+    return [file for place in places for pattern in patterns for file in sorted(place.glob(pattern))]
+
+
+def _by_poses(folder: Path, folders: Sequence[Path]) -> dict[str, Any]:
+    """Mount by both sensors' pose in the body, EuRoC's ``T_BS``; the data set's clocks are one."""
+    camera = next((other for other in folders if other.name.startswith("cam")), folder.parent / "cam0")
+    files = [sensor / "sensor.yaml" for sensor in (folder, camera)]
+    records = [camera_keys(file) if file.is_file() else {} for file in files]
+    if not all("T_BS" in record for record in records):
+        return {}
+    try:
+        T_body_imu, T_body_cam = (matrix(record["T_BS"]) for record in records)
+        return {"T_imu_cam": se3.inverse(T_body_imu) @ T_body_cam, "time_offset_s": 0.0}
+    except (KeyError, TypeError, ValueError) as error:
+        raise SourceError(f"{files[0]}, {files[1]}: T_BS is no matrix of 4 x 4") from error
+
+
+def _coverage(model: ImuModel, readings: ImuReadings, first_s: float, last_s: float) -> list[str]:
+    """Remark about frames without readings.
+
+    Raises:
+        SourceError: If no frame has any.
+    """
+    begin_s, end_s = readings.stamps_s[[0, -1]] - (model.time_offset_s or 0.0)
+    if end_s < first_s or begin_s > min(last_s, first_s + _LONGEST_S):
+        until = f" to {last_s:.2f}" if math.isfinite(last_s) else ""
+        raise SourceError(
+            f"its readings are stamped {begin_s:.2f} to {end_s:.2f} s, the frames {first_s:.2f}{until} s: those "
+            "of another flight, or of a clock that counts other seconds"
+        )
+    missing_s = max(0.0, begin_s - first_s) + max(0.0, (last_s if math.isfinite(last_s) else end_s) - end_s)
+    return [f"IMU readings are missing for {missing_s:.1f} s of the images"] if missing_s > _MISSING_S else []
