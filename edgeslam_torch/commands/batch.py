@@ -11,7 +11,7 @@ from edgeslam_torch.commands.run import add_device
 from edgeslam_torch.errors import ConfigError, OutputError, SourceError
 
 if TYPE_CHECKING:
-    from edgeslam_torch.fleet.batch import Runner
+    from edgeslam_torch.eval.experiment.runner import Runner
     from edgeslam_torch.fleet.folder import BatchSettings
     from edgeslam_torch.fleet.manifest import Flight
 
@@ -105,13 +105,14 @@ def _settings(args: argparse.Namespace) -> "BatchSettings":
 
 
 def _runner(args: argparse.Namespace) -> "Runner":
-    from edgeslam_torch.fleet.batch import Local
+    from edgeslam_torch.eval.experiment.runner import Local
     from edgeslam_torch.jobs.watched import Limits
 
     if args.ray is None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         jobs = args.jobs or cores
-        return Local(jobs, Limits(args.timeout, args.memory or min(MEMORY_MB, _SHARE * _memory_mb() / jobs)))
+        limits = Limits(args.timeout, args.memory or min(MEMORY_MB, _SHARE * _memory_mb() / jobs))
+        return Local(jobs, limits, retries=1)
     from edgeslam_torch.fleet.on_ray import OnRay
 
     if args.jobs is not None:

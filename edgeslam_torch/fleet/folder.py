@@ -4,8 +4,6 @@
 that failed; ``work/NAME`` is a flight on its way, ``older/NAME`` one of other settings.
 """
 
-import hashlib
-import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +12,14 @@ from typing import Any
 from edgeslam_torch import __version__
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.eval.experiment.runner import Task
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.config_file import load_config, to_toml
 from edgeslam_torch.files.plain import subfolder
-from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.files.signature import signature
 from edgeslam_torch.fleet.manifest import Flight
 
 FLIGHTS, JOBS, WORK, OLDER, PICTURES = "flights", "jobs", "work", "older", "pictures"
-TASK, CONFIG, RESULT, LOG = "task.json", "config.toml", "result.json", "log.txt"
 TABLE, RECORD, PAGE = "batch.csv", "batch.json", "index.html"
 
 
@@ -37,20 +34,26 @@ class BatchSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
-    """One flight, and everything that determines its results."""
+class FlightTask(Task):
+    """A flight's case; its result counts while the finished run is there."""
 
-    flight: Flight
-    config: str
-    """TOML."""
-    content: dict[str, Any]
-    """Of ``task.json``."""
+    def finished(self) -> Path:
+        """Folder of the finished run."""
+        return self.place.parent / FLIGHTS / self.name
 
-    @property
-    def key(self) -> str:
-        """Changes with the recording, its camera, telemetry and truth, the settings and our version."""
-        text = json.dumps([self.content, self.config], sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()
+    def result(self) -> dict[str, Any] | None:
+        """The result of this very case from before, if the flight finished."""
+        return Task.result(self) if self.finished().is_dir() else None
+
+    def prepare(self) -> Path:
+        """The folder of a case to be run now; results of other settings move to ``older``."""
+        batch = self.place.parent
+        (batch / PICTURES / f"{self.name}.jpg").unlink(missing_ok=True)
+        if self.finished().is_dir():
+            older = subfolder(batch, OLDER) / self.name
+            shutil.rmtree(older, ignore_errors=True)
+            self.finished().rename(older)
+        return Task.prepare(self)
 
 
 class BatchFolder:
@@ -73,8 +76,8 @@ class BatchFolder:
         if RECORD not in names:
             write_text(self.path / RECORD, "{}\n")
 
-    def task(self, flight: Flight, settings: BatchSettings) -> Task:
-        """What has to be done for a flight.
+    def task(self, flight: Flight, settings: BatchSettings) -> FlightTask:
+        """What has to be done for a flight: its recording, camera, telemetry and truth, the settings and our version.
 
         Raises:
             ConfigError: If its settings are malformed; the message names the manifest's line.
@@ -87,7 +90,7 @@ class BatchFolder:
             "recording": str(flight.recording.absolute()),
             "weights": str(config.depth.weights or ""),
         }
-        content = {
+        case = {
             "version": __version__,
             "name": flight.name,
             "batch": str(self.path),
@@ -96,32 +99,9 @@ class BatchFolder:
             "max_frames": settings.max_frames,
             "map_score": settings.map_score,
             "signatures": {name: self._signature(Path(file)) for name, file in files.items() if file},
+            "config": to_toml(config),
         }
-        return Task(flight, to_toml(config), content)
-
-    def result(self, task: Task) -> dict[str, Any] | None:
-        """The result of this very task from before, if the flight finished."""
-        try:
-            found = read_mapping(self.path / JOBS / task.flight.name / RESULT, "JSON", OutputError)
-        except OutputError:
-            return None
-        ours = found.get("key") == task.key
-        return found if ours and (self.path / FLIGHTS / task.flight.name).is_dir() else None
-
-    def prepare(self, task: Task) -> Path:
-        """The folder of a task to be done now; results of other settings move to ``older``."""
-        name = task.flight.name
-        job = subfolder(self.path, JOBS, name)
-        (job / RESULT).unlink(missing_ok=True)
-        (self.path / PICTURES / f"{name}.jpg").unlink(missing_ok=True)
-        finished = self.path / FLIGHTS / name
-        if finished.is_dir():
-            older = subfolder(self.path, OLDER) / name
-            shutil.rmtree(older, ignore_errors=True)
-            finished.rename(older)
-        write_text(job / CONFIG, task.config)
-        write_text(job / TASK, json.dumps(task.content | {"key": task.key}, indent=1) + "\n")
-        return job
+        return FlightTask(self.path / JOBS, flight.name, "edgeslam_torch.fleet.run_flight:run_flight", case)
 
     def _signature(self, path: Path) -> str:
         try:

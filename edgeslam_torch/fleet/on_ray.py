@@ -6,18 +6,18 @@ have this version of EdgeSLAM-Torch installed.
 
 import importlib
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.eval.experiment.runner import Local
 from edgeslam_torch.extras import needs_extra
-from edgeslam_torch.fleet.batch import Local
-from edgeslam_torch.fleet.folder import Task
 from edgeslam_torch.jobs.watched import Ended, How, Limits, run_each
 
+T = TypeVar("T")
 _QUEUED_PER_CPU = 2
 """Tasks handed to the cluster, those that wait included: enough to keep it busy, few enough to interrupt."""
 
@@ -32,18 +32,18 @@ class OnRay:
     retries: int = 1
     """For a process or a Ray worker that was killed."""
 
-    def __call__(self, tasks: Sequence[Task], prepare: Callable[[Task], Path]) -> Generator[tuple[Task, Ended]]:
-        """See `edgeslam_torch.fleet.batch.Runner`."""
+    def __call__(self, tasks: Iterable[T], prepare: Callable[[T], Path]) -> Generator[tuple[T, Ended]]:
+        """See `edgeslam_torch.eval.experiment.runner.Runner`."""
         ray = _connected(self.address)
         try:  # an interrupted batch disconnects: Ray ends its workers, and flights end with them (ray.cancel crashed)
             yield from self._run(ray, tasks, prepare)
         finally:
             ray.shutdown()
 
-    def _run(self, ray: Any, tasks: Sequence[Task], prepare: Callable[[Task], Path]) -> Generator[tuple[Task, Ended]]:
+    def _run(self, ray: Any, tasks: Iterable[T], prepare: Callable[[T], Path]) -> Generator[tuple[T, Ended]]:
         remote = ray.remote(num_cpus=1, max_retries=self.retries)(_attempt)
         waiting = deque(tasks)
-        running: dict[Any, Task] = {}
+        running: dict[Any, T] = {}
         while waiting or running:
             most = _QUEUED_PER_CPU * max(1, int(ray.cluster_resources().get("CPU", 1)))
             while waiting and len(running) < most:

@@ -1,71 +1,60 @@
-"""``python -m edgeslam_torch.fleet.run_flight FOLDER``: run, evaluate and report the flight of ``FOLDER/task.json``.
+"""Run, evaluate and report one flight: what the process of a batch's case does."""
 
-In a separate process, so that a failure costs one flight, and no memory is kept from one flight to the next.
-"""
-
-import json
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
 import cv2
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.errors import EdgeSlamError, OutputError
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 from edgeslam_torch.eval.report.page import write_report
 from edgeslam_torch.files.atomic import write_atomically, write_text
 from edgeslam_torch.files.config_file import load_config
-from edgeslam_torch.fleet.folder import CONFIG, FLIGHTS, PICTURES, RESULT, TASK, WORK
-from edgeslam_torch.jobs.watched import end_with_parent
+from edgeslam_torch.fleet.folder import FLIGHTS, PICTURES, WORK
 from edgeslam_torch.readers.images import pixels_or_none
 from edgeslam_torch.readers.source import Source, open_source
 from edgeslam_torch.run import run, settle_camera
 from edgeslam_torch.writers.run_writer import PICTURE
 
+CONFIG = "config.toml"
 _FROM_ABOVE = (slice(44, None), slice(0, 650))
 """Rows and columns of a run's picture that show the map from above; all three views would be too small in a row."""
 _PICTURE_WIDTH_PX = 400
 
 
-def main(folder: Path) -> int:
-    """Leave a finished run in ``flights``, a small picture and ``result.json``; else the last line on stderr says why.
+def run_flight(task: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Leave a finished run in ``flights`` and a small picture; returns figures and notes.
 
     Args:
+        task: What `BatchFolder.task` says.
         folder: Of the task, in a batch's ``jobs``.
+
+    Raises:
+        EdgeSlamError: If it fails.
     """
-    task: dict[str, Any] = json.loads((folder / TASK).read_text(encoding="utf-8"))
     batch, name = Path(task["batch"]), task["name"]
     work = batch / WORK / name
     shutil.rmtree(work, ignore_errors=True)  # of a process that was killed
     if work.is_symlink():
         work.unlink()
-    try:
-        config = load_config(SlamConfig(), folder / CONFIG, ())
-        source = open_source(
-            task["recording"], task["camera"] or None, task["telemetry"] or None, task["max_frames"], task["topics"]
-        )
-        settle_camera(source)
-        result = run(source, work, config)
-        if result.interrupted or result.failure is not None:
-            sys.stderr.write(f"{result.failure or 'interrupted'}\n")
-            return 1
-        truth = task["truth"] or (task["recording"] if source.groundtruth is not None else None)
-        score, note = _score(work, truth, bool(task["truth"]), task["map_score"])
-        write_report(work, truth if score is not None else None, judge_map=task["map_score"])
-        _write_picture(work / PICTURE, batch / PICTURES / f"{name}.jpg")
-        work.rename(batch / FLIGHTS / name)
-    except EdgeSlamError as error:
-        sys.stderr.write(" ".join(str(error).split()) + "\n")
-        return 1
-    found = {
-        "key": task["key"],
-        "figures": figures(result.summary, score),
-        "notes": [*_notes(source), *result.summary["warnings"], *note, *(score.notes if score is not None else ())],
-    }
-    write_text(folder / RESULT, json.dumps(found, indent=1, default=float) + "\n")
-    return 0
+    write_text(folder / CONFIG, task["config"])
+    config = load_config(SlamConfig(), folder / CONFIG, ())
+    source = open_source(
+        task["recording"], task["camera"] or None, task["telemetry"] or None, task["max_frames"], task["topics"]
+    )
+    settle_camera(source)
+    result = run(source, work, config)
+    if result.interrupted or result.failure is not None:
+        raise OutputError(result.failure or "interrupted")
+    truth = task["truth"] or (task["recording"] if source.groundtruth is not None else None)
+    score, note = _score(work, truth, task["map_score"])
+    write_report(work, truth if score is not None else None, judge_map=task["map_score"])
+    _write_picture(work / PICTURE, batch / PICTURES / f"{name}.jpg")
+    work.rename(batch / FLIGHTS / name)
+    notes = [*_notes(source), *result.summary["warnings"], *note, *(score.notes if score is not None else ())]
+    return {"figures": figures(result.summary, score), "notes": notes}
 
 
 def figures(summary: dict[str, Any], score: RunScore | None) -> dict[str, Any]:
@@ -98,7 +87,7 @@ def figures(summary: dict[str, Any], score: RunScore | None) -> dict[str, Any]:
     return found
 
 
-def _score(work: Path, truth: str | None, given: bool, map_score: bool) -> tuple[RunScore | None, list[str]]:
+def _score(work: Path, truth: str | None, map_score: bool) -> tuple[RunScore | None, list[str]]:
     """The run against its truth; why not, when there is one that cannot be used."""
     if truth is None:
         return None, []
@@ -122,8 +111,3 @@ def _write_picture(big: Path, small: Path) -> None:
     image = cv2.resize(image, (_PICTURE_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
     jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
     write_atomically(small, lambda file: file.write(jpeg.tobytes()))
-
-
-if __name__ == "__main__":
-    end_with_parent()
-    sys.exit(main(Path(sys.argv[1])))

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -160,8 +160,10 @@ def run_each(items: Iterable[T], start: Callable[[T], Job], jobs: int, retries: 
             job.kill()
 
 
-def start_module(module: str, folder: Path, log: IO[str]) -> subprocess.Popen[str]:
-    """A module of ours that works on a folder, on one thread, out of reach of the terminal's Ctrl-C.
+def start_module(
+    module: str, folder: Path, log: IO[str], environment: Mapping[str, str] = ONE_THREAD
+) -> subprocess.Popen[str]:
+    """A module of ours that works on a folder, out of reach of the terminal's Ctrl-C; on one thread by default.
 
     It may call `end_with_parent`, which ends it when this process dies.
     """
@@ -171,7 +173,7 @@ def start_module(module: str, folder: Path, log: IO[str]) -> subprocess.Popen[st
         stdout=log,
         stderr=log,
         text=True,
-        env=os.environ | ONE_THREAD,
+        env={**os.environ, **environment},
         start_new_session=os.name == "posix",
     )
 

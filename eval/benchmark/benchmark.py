@@ -1,7 +1,7 @@
-"""Runs on every available sequence with several seeds, each in its own process; stored as JSON for comparison.
+"""Runs of ``edgeslam run`` on every available sequence with several seeds; stored as JSON for comparison.
 
-Between the runs the same fixed work is timed (`machine_speed`), and solver and depth network alone (`bench_probes`);
-other load is measured. `compare` derives noise and verdicts.
+Between the runs the same fixed work is timed (`machine_speed`), and solver and depth network alone (`probes`); other
+load is measured. `compare` derives noise and verdicts. `run_rows` makes the same runs with several sets of settings.
 """
 
 import json
@@ -10,21 +10,20 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from edgeslam_torch import __version__
-from edgeslam_torch.errors import EdgeSlamError
-from edgeslam_torch.eval.benchmark import probes as bench_probes
+from edgeslam_torch.eval.benchmark import probes
 from edgeslam_torch.eval.benchmark.compare import (
     ALONE,
     FORMAT,
     METRICS,
-    Metric,
     alone_metrics,
     busy_runs,
     medians_of,
@@ -33,24 +32,24 @@ from edgeslam_torch.eval.benchmark.compare import (
     sequences_of,
     stage_metrics,
 )
-from edgeslam_torch.eval.benchmark.conditions import code_state, machine
 from edgeslam_torch.eval.benchmark.machine_speed import MachineSpeed, disturbance, read_cpu_times
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.dataset import open_dataset
+from edgeslam_torch.eval.experiment.conditions import code_state, machine
+from edgeslam_torch.eval.experiment.figures import Figure
+from edgeslam_torch.eval.experiment.runner import MODULE, Local, Task, run_tasks
+from edgeslam_torch.eval.inputs.dataset import find_recordings
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
+from edgeslam_torch.eval.report.tables import markdown_table
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.jobs.watched import Limits, start_module
 
 SYNTHETIC = "synthetic"
 """Name of the simulated flight among the sequences."""
-
 _MIN_HZ = 15.0
 """Recordings with a lower frame rate are for training, not for tracking."""
-
 _RUN_TIMEOUT_S = 1800.0
 _PEERS = Path(__file__).with_name("peers.toml")
-_OWN = "edgeslam"
-
-
+_CLI = "import sys; from edgeslam_torch.cli import main; sys.exit(main())"
 _NOISE_WORDS = (
     "noise: what two such medians differ by without meaning anything. Accuracy: 2 sqrt(s_a^2/n_a + s_b^2/n_b) over the "
     "seeds; one seed offline gives the same trajectory and map every time. Times: at one machine speed (the reference "
@@ -76,32 +75,20 @@ class BenchSettings:
     """Time the solver's window and the depth network too."""
 
 
-def find_sequences(data: Path | None, min_hz: float = _MIN_HZ) -> dict[str, Path]:
-    """Recordings with ground truth and images at no less than a rate, by name; a camera's rate when none is given.
-
-    ``data`` itself, its folders and theirs are looked at.
+def sequences(
+    settings: BenchSettings, min_hz: float = _MIN_HZ, others: Sequence[str] = (SYNTHETIC,)
+) -> dict[str, Path]:
+    """Folders of the sequences to run, by name; of ``others`` there is none yet.
 
     Raises:
-        EvaluationError: If ``data`` is given but is no folder.
+        EvaluationError: If a named sequence is not there.
     """
-    if data is None:
-        return {}
-    if not data.is_dir():
-        raise EvaluationError(f"{data}: no such folder of recordings (--data or EDGESLAM_DATA)")
-    found: dict[str, Path] = {}
-    folders = sorted(p for p in data.iterdir() if p.is_dir())
-    deeper = [p for folder in folders for p in sorted(folder.iterdir()) if p.is_dir()]
-    for folder in [data, *folders, *deeper]:
-        if folder.parent in found.values():  # a part of a recording
-            continue
-        try:
-            dataset = open_dataset(folder)
-        except EdgeSlamError:
-            continue
-        stamps = dataset.frame_stamps_s
-        if len(stamps) > 30 and 1.0 / float(np.median(np.diff(stamps))) >= min_hz:
-            found[dataset.name] = folder
-    return found
+    found = {} if settings.data is None else find_recordings(settings.data, min_hz=min_hz)
+    known = {name: folder for name, (folder, _) in found.items()} | dict.fromkeys(others, Path())
+    missing = [name for name in settings.only if name not in known]
+    if missing or not known:
+        raise EvaluationError(f"no sequence {missing[0] if missing else ''!r}; there are {', '.join(known)}")
+    return {name: known[name] for name in settings.only or known}
 
 
 def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]) -> dict[str, Any]:
@@ -110,18 +97,16 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
     Args:
         settings: What is run.
         out: Folder for the runs' own folders and ``bench.json``.
-        say: Told one line before and after every run.
+        say: Told one line after every run.
 
     Raises:
         EvaluationError: If a named sequence is not there.
     """
     begin = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
-    sequences = find_sequences(settings.data)
-    names = settings.only or (*sequences, SYNTHETIC)
-    missing = [n for n in names if n not in sequences and n != SYNTHETIC]
-    if missing:
-        raise EvaluationError(f"no sequence {missing[0]!r}; there are {', '.join([*sequences, SYNTHETIC])}")
+    folders = sequences(settings)
+    if SYNTHETIC in folders:
+        folders[SYNTHETIC] = _record_synthetic(out, settings, say)
     record: dict[str, Any] = {
         "format": FORMAT,
         "version": __version__,
@@ -134,37 +119,125 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
         "overrides": list(settings.overrides),
         "runs": [],
     }
-    # All runs first, then all judging: on Linux a child's peak memory starts from its parent's at the time of the
-    # fork, and the measured surfaces take a gigabyte.
-    folders = {name: sequences.get(name) or _record_synthetic(out, settings, say) for name in names}
-    bouts: list[dict[str, Any]] = []
+    tasks = {
+        (name, seed): _task(out, f"{name}_seed{seed}", folder, seed, settings)
+        for name, folder in folders.items()
+        for seed in settings.seeds
+    }
     with MachineSpeed() as speed:
         say("reference work ...")
-        measure = bench_probes.bout if settings.micro else bench_probes.reference_alone
+        measure = probes.bout if settings.micro else probes.reference_alone
         speed.time(measure)  # loads and warms everything
-        bouts.append(speed.time(measure))
-        for name, folder in folders.items():
-            for seed in settings.seeds:
-                say(f"{name}, seed {seed} ...")
-                begun = read_cpu_times()
-                run = _one_run(name, folder, seed, settings, out / f"{name}_seed{seed}")
-                found = disturbance(begun, read_cpu_times())
-                bouts.append(speed.time(measure))
-                run["disturbance"] = asdict(found) | {"busy": found.busy} if found is not None else None
-                run["reference"] = _between(bouts[-2]["reference"], bouts[-1]["reference"])
-                record["runs"].append(run)
-                record |= bench_probes.gather(bouts)
-                _save(record, out / "bench.json")
-                if found is not None and found.busy:
-                    say(f"the machine is busy: others use {found.others:.0%}, the host {found.stolen:.0%} of it")
-    for run in record["runs"]:
-        name, seed = run["sequence"], run["seed"]
-        _judge(run, out / f"{name}_seed{seed}", folders[name])
-        say(f"{name}, seed {seed}: {_one_line(run)}")
-        _save(record, out / "bench.json")
+        bouts: list[dict[str, Any]] = [speed.time(measure)]
+        for run in _runs(tasks, say, resume=False):
+            bouts.append(speed.time(measure))
+            before, after = (bout["reference"] for bout in bouts[-2:])
+            run["reference"] = {key: (before[key] + after[key]) / 2 for key in before}  # while the run went on
+            record["runs"].append(run)
+            record |= probes.gather(bouts)
+            _save(record, out / "bench.json")
     record["took_s"] = time.monotonic() - begin
     _save(record, out / "bench.json")
     return record
+
+
+def run_rows(
+    settings: BenchSettings,
+    rows: Mapping[str, tuple[Sequence[str], str]],
+    out: Path,
+    say: Callable[[str], None],
+    min_hz: float = 0.0,
+) -> dict[str, dict[str, Any]]:
+    """The runs of a benchmark, without its timing, once with every row's settings; results in ``out`` are kept.
+
+    Args:
+        settings: What is run.
+        rows: ``section.key=value`` by the row's name, and a statement that its process executes first.
+        out: Folder for the runs.
+        say: Told one line after every run.
+        min_hz: Least frame rate of a recording.
+
+    Returns:
+        A record of each row, whose ``runs`` `compare` reads.
+
+    Raises:
+        EvaluationError: If a named sequence is not there.
+    """
+    folders = sequences(settings, min_hz, ())
+    tasks = {
+        (name, seed, row): _task(out, f"{row}_{name}_seed{seed}", folder, seed, settings, overrides, first)
+        for name, folder in folders.items()
+        for seed in settings.seeds
+        for row, (overrides, first) in rows.items()
+    }
+    records: dict[str, dict[str, Any]] = {row: {"runs": []} for row in rows}
+    for (*_, row), run in zip(tasks, _runs(tasks, say), strict=True):
+        records[row]["runs"].append(run)
+    return records
+
+
+def _task(
+    out: Path, name: str, folder: Path, seed: int, settings: BenchSettings, more: Sequence[str] = (), first: str = ""
+) -> Task:
+    arguments = ["--seed", str(seed), "--mode", settings.mode, "--no-progress", "--no-report"]
+    arguments += ["--max-frames", str(settings.max_frames)] if settings.max_frames is not None else []
+    for override in (*settings.overrides, *more):
+        arguments += ["--set", override]
+    case = {"commit": code_state(), "recording": str(folder), "arguments": arguments, "first": first}
+    return Task(
+        out / "cases", name, "edgeslam_torch.eval.benchmark.benchmark:run_sequence", case, {"out": str(out / name)}
+    )
+
+
+def run_sequence(case: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Run and evaluate one sequence; what the process of a benchmark's case does.
+
+    Raises:
+        EvaluationError: If the run fails, or cannot be compared with its ground truth.
+    """
+    command = [sys.executable, "-c", f"{case['first']}\n{_CLI}", "run", case["recording"], "--out", case["out"]]
+    begun, before_s = read_cpu_times(), _children_cpu_s()
+    done = subprocess.run([*command, *case["arguments"]], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        lines = (done.stderr or done.stdout).strip().splitlines()
+        raise EvaluationError(lines[-1] if lines else f"exit code {done.returncode}")
+    cpu_s, found = _children_cpu_s() - before_s, disturbance(begun, read_cpu_times())
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    score = evaluate_run(case["out"], case["recording"])
+    figures = figures_of(score)
+    if cpu_s > 0:  # with start-up and writing, which the run itself cannot see
+        figures["cpu_ms_per_frame"] = 1e3 * cpu_s / score.summary["frames"]
+    return {
+        "figures": figures,
+        "stages": score.summary.get("stage_mean_ms_per_frame") or {},
+        "load": load,
+        "process_cpu_s": cpu_s,
+        "disturbance": asdict(found) | {"busy": found.busy} if found is not None else None,
+        "scale_inside_95": score.scale_inside_95,
+        "notes": list(score.notes),
+    }
+
+
+def _runs(tasks: Mapping[Any, Task], say: Callable[[str], None], resume: bool = True) -> Iterable[dict[str, Any]]:
+    """Runs of cases whose first two parts are sequence and seed, in the cases' order, one at a time."""
+    start = partial(start_module, MODULE, environment={})  # threads as the user's own runs have them
+    found = dict[Any, dict[str, Any]]()
+    waiting = list(tasks)
+    for case, result, ended in run_tasks(tasks, Local(1, Limits(_RUN_TIMEOUT_S), start=start), resume):
+        run = {"sequence": case[0], "seed": case[1], "figures": {}, "stages": {}, "error": ""}
+        run |= {"error": ended.reason.removesuffix(" (exit code 1)")} if result is None and ended else result or {}
+        run.pop("key", None)
+        found[case] = run
+        if ended is not None:
+            say(f"{case[0]}, seed {case[1]}{''.join(f', {part}' for part in case[2:])}: {_one_line(run)}")
+        while waiting and waiting[0] in found:
+            yield found.pop(waiting.pop(0))
+
+
+def _children_cpu_s() -> float:
+    """User and system time of all ended child processes; always 0 on Windows."""
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def figures_of(score: RunScore) -> dict[str, float | None]:
@@ -180,10 +253,8 @@ def figures_of(score: RunScore) -> dict[str, float | None]:
         "rotation_deg": score.rotation_deg,
         "rpe_1s_m": score.rpe_1s_m,
         "full_transform": score.full_transform,
-        "fps": summary.get("fps"),
-        "cpu_ms_per_frame": summary.get("cpu_ms_per_frame"),
-        "peak_rss_mb": summary.get("peak_rss_mb"),
-        "dropped_frames": summary.get("dropped_frames"),
+        **{name: summary.get(name) for name in ("fps", "cpu_ms_per_frame", "peak_rss_mb", "dropped_frames")},
+        "finish_ms": 1e3 * summary["finish_s"] if "finish_s" in summary else None,
     }
     if score.map is not None:
         found = score.map
@@ -198,85 +269,6 @@ def figures_of(score: RunScore) -> dict[str, float | None]:
             "edges_within_6cm": found.completeness.get(0.06),
         }
     return {k: float(v) if v is not None and np.isfinite(v) else None for k, v in own.items()}
-
-
-def markdown_bench(record: dict[str, Any]) -> str:
-    """One table a sequence: every run, their median, and the peers' figures."""
-    parts = [_conditions(record), "", _NOISE_WORDS]
-    for name in sequences_of(record):
-        peers = [p for p in read_peers() if p["sequence"].startswith(name) or p["sequence"].split()[0] in name]
-        runs = [r for r in record["runs"] if r["sequence"] == name]
-        own = [(f"{_OWN}, seed {r['seed']}", _lists(r.get("figures", {}))) for r in runs]
-        if len(runs) > 1:
-            own.append((f"**{_OWN}, median of {len(runs)}**", medians_of(record, name)))
-            own.append(("its noise: two of these differ by less (±)", noise_of(record, name)))
-        other = [(f"{_peer_name(p, name)} [{k}]", _peer_figures(p)) for k, p in enumerate(peers, start=1)]
-        parts += ["", f"### {name}", "", _table([*own, *other])]
-        errors = [f"- seed {r['seed']} failed: {r['error']}" for r in runs if r.get("error")]
-        notes = [f"[{k}] {p['source']}; {p['conditions']}" for k, p in enumerate(peers, start=1)]
-        parts += ([""] + errors if errors else []) + ([""] + notes if notes else [])
-        parts += _times_line("stages, mean ms per frame, median of the runs", record, name, stage_metrics(record, name))
-    for part, title in (("solver", "solver window, CPU ms"), ("depth", "depth network, one thread, ms an image")):
-        texts = [f"{k} {v}" for k, v in (record.get(part) or {}).items() if isinstance(v, str)]
-        metrics = [m for m in alone_metrics(record) if m.name.startswith(part)]
-        parts += _times_line(", ".join([title, *texts]), record, ALONE, metrics)
-        if texts and not metrics:
-            parts += ["", f"{title}: {', '.join(texts)}"]
-    parts += ["", *_machine_lines(record)]
-    return "\n".join(parts) + "\n"
-
-
-def read_peers(path: Path = _PEERS) -> list[dict[str, Any]]:
-    """Stored figures of other systems, each with its source and conditions."""
-    return list(tomllib.loads(path.read_text(encoding="utf-8"))["peer"])
-
-
-def _between(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
-    """The reference work's times while a run went on: the mean of right before and right after."""
-    return {key: (before[key] + after[key]) / 2 for key in before}
-
-
-def _one_run(name: str, folder: Path, seed: int, settings: BenchSettings, out: Path) -> dict[str, Any]:
-    """One run in its own process, not judged yet."""
-    command = [sys.executable, "-m", "edgeslam_torch.cli", "run", str(folder), "--out", str(out)]
-    command += ["--seed", str(seed), "--mode", settings.mode, "--no-progress", "--no-report"]
-    command += ["--max-frames", str(settings.max_frames)] if settings.max_frames is not None else []
-    for override in settings.overrides:
-        command += ["--set", override]
-    run: dict[str, Any] = {"sequence": name, "seed": seed, "figures": {}, "stages": {}, "error": ""}
-    before_s = _children_cpu_s()
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_RUN_TIMEOUT_S, check=False)
-    except subprocess.TimeoutExpired:
-        return run | {"error": f"took longer than {_RUN_TIMEOUT_S:.0f} s"}
-    if done.returncode != 0:
-        lines = (done.stderr or done.stdout).strip().splitlines()
-        return run | {"error": lines[-1] if lines else f"exit code {done.returncode}"}
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    return run | {"load": load, "process_cpu_s": _children_cpu_s() - before_s}
-
-
-def _children_cpu_s() -> float:
-    """User and system time of all ended child processes; always 0 on Windows."""
-    times = os.times()
-    return times.children_user + times.children_system
-
-
-def _judge(run: dict[str, Any], out: Path, folder: Path) -> None:
-    """Add figures to a run that ended well."""
-    if run["error"]:
-        return
-    try:
-        score = evaluate_run(out, folder)
-    except EdgeSlamError as error:
-        run["error"] = str(error)
-        return
-    run["figures"] = figures_of(score)
-    if run["process_cpu_s"] > 0:  # with start-up and writing, which the run itself cannot see
-        run["figures"]["cpu_ms_per_frame"] = 1e3 * run["process_cpu_s"] / score.summary["frames"]
-    run["stages"] = score.summary.get("stage_mean_ms_per_frame") or {}
-    run["scale_inside_95"] = score.scale_inside_95
-    run["notes"] = list(score.notes)
 
 
 def _record_synthetic(out: Path, settings: BenchSettings, say: Callable[[str], None]) -> Path:
@@ -305,43 +297,58 @@ def _one_line(run: dict[str, Any]) -> str:
     text = f"ATE {f['ate_sim3_m']:.4f} m, coverage {f['coverage']:.1%}"
     if f.get("map_median_m") is not None:
         text += f", map {f['map_points']:.0f} points, {f['map_median_m']:.4f} m"
-    return text + (f", {f['cpu_ms_per_frame']:.0f} ms CPU per frame" if f.get("cpu_ms_per_frame") else "")
+    text += f", {f['cpu_ms_per_frame']:.0f} ms CPU per frame" if f.get("cpu_ms_per_frame") else ""
+    other = run.get("disturbance")
+    busy = f"; the machine is busy: others use {other['others']:.0%}, the host {other['stolen']:.0%}" if other else ""
+    return text + (busy if other and other["busy"] else "")
 
 
-def _lists(figures: dict[str, float | None]) -> dict[str, list[float]]:
-    return {k: [v] for k, v in figures.items() if v is not None}
+def read_peers(path: Path = _PEERS) -> list[dict[str, Any]]:
+    """Stored figures of other systems, each with its source and conditions."""
+    return list(tomllib.loads(path.read_text(encoding="utf-8"))["peer"])
 
 
-def _peer_name(peer: dict[str, Any], sequence: str) -> str:
-    """System, and on what, where its figure is not of this very sequence."""
-    return str(peer["system"]) if peer["sequence"] == sequence else f"{peer['system']}, {peer['sequence']}"
+def markdown_bench(record: dict[str, Any]) -> str:
+    """One table a sequence: every run, their median, and the peers' figures."""
+    parts = [_conditions(record), "", _NOISE_WORDS]
+    for name in sequences_of(record):
+        peers = [p for p in read_peers() if p["sequence"].startswith(name) or p["sequence"].split()[0] in name]
+        runs = [r for r in record["runs"] if r["sequence"] == name]
+        rows = {f"edgeslam, seed {r['seed']}": r.get("figures", {}) for r in runs}
+        if len(runs) > 1:
+            rows[f"**edgeslam, median of {len(runs)}**"] = medians_of(record, name)
+            rows["its noise: two of these differ by less (±)"] = noise_of(record, name)
+        for k, peer in enumerate(peers, start=1):
+            where = "" if peer["sequence"] == name else f", {peer['sequence']}"
+            rows[f"{peer['system']}{where} [{k}]"] = peer | {"ate_sim3_m": peer["ate_m"]}
+        used = [m for m in METRICS if any(figures.get(m.name) is not None for figures in rows.values())]
+        cells = [[title, *(_values(m, figures.get(m.name)) for m in used)] for title, figures in rows.items()]
+        parts += ["", f"### {name}", "", markdown_table(["system", *(m.title for m in used)], cells)]
+        errors = [f"- seed {r['seed']} failed: {r['error']}" for r in runs if r.get("error")]
+        notes = [f"[{k}] {p['source']}; {p['conditions']}" for k, p in enumerate(peers, start=1)]
+        parts += ([""] + errors if errors else []) + ([""] + notes if notes else [])
+        parts += _times_line("stages, mean ms per frame, median of the runs", record, name, stage_metrics(record, name))
+    for part, title in (("solver", "solver window, CPU ms"), ("depth", "depth network, one thread, ms an image")):
+        texts = [f"{k} {v}" for k, v in (record.get(part) or {}).items() if isinstance(v, str)]
+        metrics = [m for m in alone_metrics(record) if m.name.startswith(part)]
+        parts += _times_line(", ".join([title, *texts]), record, ALONE, metrics)
+        parts += ["", f"{title}: {', '.join(texts)}"] if texts and not metrics else []
+    return "\n".join([*parts, "", *_machine_lines(record)]) + "\n"
 
 
-def _peer_figures(peer: dict[str, Any]) -> dict[str, list[float]]:
-    names = {"ate_m": "ate_sim3_m"}
-    out = {}
-    for key, value in peer.items():
-        if isinstance(value, (int, float, list)):
-            out[names.get(key, key)] = [float(v) for v in value] if isinstance(value, list) else [float(value)]
-    return out
+def _values(metric: Figure, values: Any) -> str:
+    """Every value of a figure, of which a peer has a list."""
+    if values is None:
+        return "-"
+    return " ".join(metric.text.format(v) for v in (values if isinstance(values, list) else [values]))
 
 
-def _table(rows: Iterable[tuple[str, dict[str, list[float]]]]) -> str:
-    rows = list(rows)
-    used = [m for m in METRICS if any(m.name in figures for _, figures in rows)]
-    lines = ["| system | " + " | ".join(m.title for m in used) + " |", "|" + "---|" * (len(used) + 1)]
-    for title, figures in rows:
-        cells = [" ".join(m.text.format(v) for v in figures[m.name]) if m.name in figures else "-" for m in used]
-        lines.append(f"| {title} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def _times_line(title: str, record: dict[str, Any], name: str, metrics: Sequence[Metric]) -> list[str]:
+def _times_line(title: str, record: dict[str, Any], name: str, metrics: Sequence[Figure]) -> list[str]:
     """Medians of some times with their noise, in one line."""
     medians, noise = medians_of(record, name, metrics), noise_of(record, name, metrics)
     cells = [
         f"{m.title.split(' [')[0].split(' ', 1)[-1] if name == ALONE else m.title.split(' [')[0]} "
-        f"{medians[m.name][0]:.2f} ±{noise[m.name][0]:.2f}"
+        f"{medians[m.name]:.2f} ±{noise[m.name]:.2f}"
         for m in metrics
         if m.name in medians
     ]

@@ -1,84 +1,48 @@
 """The benchmark's figures, their noise, and the comparison of two records.
 
 Accuracy repeats to the byte for a seed and speed does not (on a shared machine a run takes 1.5 times as long minutes
-later), so figures have their own kinds of noise:
-
-- accuracy: offline the same seed gives the same bytes, so what differs is the seed. Two medians differ by chance by
-  ``2 sqrt(s_a^2/n_a + s_b^2/n_b)``, with ``s`` the sample standard deviation over the seeds;
-- times: every run's time is brought to one machine speed by the fixed work that was timed right before and after it
-  (`machine_speed.reference`). ``s`` is what still scatters, relative, pooled over the sequences; as a table has some
-  fifty times, three sigma instead of two, and 1.25 because medians scatter more than means;
-- both: never less than a floor per figure, for what one record cannot see of itself.
+later). So every run's time is brought to one machine speed by the fixed work that was timed right before and after it
+(`machine_speed.reference`), and what still scatters is pooled, relative, over the sequences. As a table has some fifty
+times, they take three sigma instead of two, and 1.25 because medians scatter more than means.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.experiment.figures import SIGMAS, Figure, chance, difference, scatter
+from edgeslam_torch.eval.report.tables import markdown_table
 from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.types import FloatArray
 
 FORMAT = 2
 """Of a record; 1 had no reference work, and single values for solver and depth network."""
-
-_SIGMAS = 2.0
 _TIMED_SIGMAS = 3.0 * 1.25
 _SHORTEST_STAGE_MS = 0.05
 """Mean milliseconds a frame below which a stage is not worth comparing."""
-
+_STAGE_FLOOR, _ALONE_FLOOR = 0.15, 0.10
 ALONE = "the parts alone"
 """Sequence name of the solver's and the depth network's times."""
 
-
-@dataclass(frozen=True, slots=True)
-class Metric:
-    """One figure of a run."""
-
-    name: str
-    title: str
-    text: str
-    lower_is_better: bool
-    floor: float
-    """Relative difference below which two medians count as equal, whatever their scatter."""
-    clock: str = ""
-    """Which time of the reference work it follows (`machine_speed.reference`); empty when it is no time."""
-
-
 METRICS = (
-    Metric("ate_sim3_m", "ATE Sim(3) [m]", "{:.4f}", True, 0.03),
-    Metric("ate_online_sim3_m", "online [m]", "{:.4f}", True, 0.03),
-    Metric("ate_se3_m", "ATE SE(3) [m]", "{:.4f}", True, 0.03),
-    Metric("scale_error_abs", "scale off", "{:.1%}", True, 0.05),
-    Metric("coverage", "coverage", "{:.1%}", False, 0.005),
-    Metric("first_pose_s", "first pose [s]", "{:.2f}", True, 0.05),
-    Metric("map_points", "map points", "{:.0f}", False, 0.05),
-    Metric("map_median_m", "map error [m]", "{:.4f}", True, 0.03),
-    Metric("map_within_6cm", "points in 6 cm", "{:.0%}", False, 0.02),
-    Metric("edges_within_2cm", "edges in 2 cm", "{:.0%}", False, 0.03),
-    Metric("edges_within_6cm", "edges in 6 cm", "{:.0%}", False, 0.02),
-    Metric("cpu_ms_per_frame", "CPU [ms/frame]", "{:.1f}", True, 0.10, "cpu_ms"),
-    Metric("fps", "frames/s", "{:.1f}", False, 0.15, "wall_ms"),
-    Metric("peak_rss_mb", "memory [MB]", "{:.0f}", True, 0.05),
+    Figure("ate_sim3_m", "ATE Sim(3) [m]", floor=0.03),
+    Figure("ate_online_sim3_m", "online [m]", floor=0.03),
+    Figure("ate_se3_m", "ATE SE(3) [m]", floor=0.03),
+    Figure("scale_error_abs", "scale off", "{:.1%}", floor=0.05),
+    Figure("coverage", "coverage", "{:.1%}", floor=0.005, lower_is_better=False),
+    Figure("first_pose_s", "first pose [s]", "{:.2f}", floor=0.05),
+    Figure("map_points", "map points", "{:.0f}", floor=0.05, lower_is_better=False),
+    Figure("map_median_m", "map error [m]", floor=0.03),
+    Figure("map_within_6cm", "points in 6 cm", "{:.0%}", floor=0.02, lower_is_better=False),
+    Figure("edges_within_2cm", "edges in 2 cm", "{:.0%}", floor=0.03, lower_is_better=False),
+    Figure("edges_within_6cm", "edges in 6 cm", "{:.0%}", floor=0.02, lower_is_better=False),
+    Figure("cpu_ms_per_frame", "CPU [ms/frame]", "{:.1f}", floor=0.10, clock="cpu_ms"),
+    Figure("fps", "frames/s", "{:.1f}", floor=0.15, lower_is_better=False, clock="wall_ms"),
+    Figure("peak_rss_mb", "memory [MB]", "{:.0f}", floor=0.05),
 )
-
-_STAGE_FLOOR, _ALONE_FLOOR = 0.15, 0.10
-
-
-@dataclass(frozen=True, slots=True)
-class _Series:
-    """One figure's values in one record."""
-
-    raw: FloatArray
-    level: FloatArray
-    """The same at the record's median machine speed."""
-    scatter: float
-    """Relative standard deviation of one value of ``level``."""
-    reference_ms: float
-    """Median of the reference work in the record; NaN when it has none or the figure is no time."""
 
 
 def compare(before: dict[str, Any], after: dict[str, Any]) -> list[dict[str, Any]]:
@@ -89,45 +53,44 @@ def compare(before: dict[str, Any], after: dict[str, Any]) -> list[dict[str, Any
     """
     rows = []
     for name, metric in _compared(before, after):
-        a, b = _series(before, name, metric), _series(after, name, metric)
-        if len(a.raw) == 0 or len(b.raw) == 0:
+        (raw_a, a), (raw_b, b) = (_levelled(record, name, metric) for record in (before, after))
+        if len(a) == 0 or len(b) == 0:
             continue
-        first, second = float(np.median(a.level)), float(np.median(b.level))
-        at_speed = second * _to_speed(metric, b.reference_ms, a.reference_ms)
-        noise = max(_chance(metric, a, b), metric.floor * abs(first))
-        change = at_speed - first
-        gain = -change if metric.lower_is_better else change
+        b = b * _to_speed(metric, after, before)
+        by_chance = _chance(metric, (a, b), [_scatter(r, name, metric, v) for r, v in ((before, a), (after, b))])
+        found = difference(metric, a.tolist(), b.tolist(), by_chance)
         rows.append(
             {
                 "sequence": name,
                 "metric": metric.name,
                 "title": metric.title,
                 "text": metric.text,
-                "before": float(np.median(a.raw)),
-                "after": float(np.median(b.raw)),
-                "at_speed": at_speed,
-                "change": change,
-                "noise": noise,
-                "verdict": "same" if abs(change) <= noise else "better" if gain > 0 else "worse",
+                "before": float(np.median(raw_a)),
+                "after": float(np.median(raw_b)),
+                "at_speed": found.after,
+                "change": found.after - found.before,
+                "noise": found.noise,
+                "verdict": found.verdict,
             }
         )
     return rows
 
 
-def noise_of(record: dict[str, Any], name: str, metrics: Sequence[Metric] = METRICS) -> dict[str, list[float]]:
+def noise_of(record: dict[str, Any], name: str, metrics: Sequence[Figure] = METRICS) -> dict[str, float]:
     """Differences that `compare` would not consider significant for a second record like this one."""
     out = {}
     for metric in metrics:
-        found = _series(record, name, metric)
-        if len(found.raw):
-            out[metric.name] = [max(_chance(metric, found, found), metric.floor * abs(float(np.median(found.level))))]
+        _, values = _levelled(record, name, metric)
+        if len(values):
+            by_chance = _chance(metric, (values, values), [_scatter(record, name, metric, values)] * 2)
+            out[metric.name] = difference(metric, values.tolist(), values.tolist(), by_chance).noise
     return out
 
 
-def medians_of(record: dict[str, Any], name: str, metrics: Sequence[Metric] = METRICS) -> dict[str, list[float]]:
+def medians_of(record: dict[str, Any], name: str, metrics: Sequence[Figure] = METRICS) -> dict[str, float]:
     """Medians as measured."""
-    found = {metric.name: _values(record, name, metric)[0] for metric in metrics}
-    return {key: [float(np.median(values))] for key, values in found.items() if len(values)}
+    found = {metric.name: _levelled(record, name, metric)[0] for metric in metrics}
+    return {key: float(np.median(values)) for key, values in found.items() if len(values)}
 
 
 def sequences_of(record: dict[str, Any]) -> list[str]:
@@ -135,23 +98,23 @@ def sequences_of(record: dict[str, Any]) -> list[str]:
     return list(dict.fromkeys(r["sequence"] for r in record["runs"]))
 
 
-def stage_metrics(record: dict[str, Any], name: str) -> list[Metric]:
+def stage_metrics(record: dict[str, Any], name: str) -> list[Figure]:
     """The stages of a sequence's runs as figures, the longest first."""
     runs = [r["stages"] for r in record["runs"] if r["sequence"] == name and r.get("stages")]
     means = {
         stage: float(np.mean([s.get(stage, 0.0) for s in runs])) for stage in dict.fromkeys(k for s in runs for k in s)
     }
     return [
-        Metric(f"stage:{stage}", f"{stage} [ms per frame]", "{:.2f}", True, _STAGE_FLOOR, "wall_ms")
+        Figure(f"stage:{stage}", f"{stage} [ms per frame]", "{:.2f}", floor=_STAGE_FLOOR, clock="wall_ms")
         for stage, mean in sorted(means.items(), key=lambda kv: -kv[1])
         if mean >= _SHORTEST_STAGE_MS
     ]
 
 
-def alone_metrics(record: dict[str, Any]) -> list[Metric]:
+def alone_metrics(record: dict[str, Any]) -> list[Figure]:
     """Solver and depth network as figures; those that were measured several times."""
     return [
-        Metric(f"{part}:{key}", f"{part} {key} [ms]", "{:.1f}", True, _ALONE_FLOOR, "one_ms")
+        Figure(f"{part}:{key}", f"{part} {key} [ms]", "{:.1f}", floor=_ALONE_FLOOR, clock="one_ms")
         for part in ("solver", "depth")
         for key, values in (record.get(part) or {}).items()
         if isinstance(values, list) and values and all(isinstance(v, (int, float)) and np.isfinite(v) for v in values)
@@ -172,20 +135,19 @@ def read_record(path: Path) -> dict[str, Any]:
 
 def markdown_compare(before: dict[str, Any], after: dict[str, Any]) -> str:
     """The comparison as a table, what to beware of, and how many differences lie inside the noise."""
-    rows = compare(before, after)
-    lines = ["| sequence | figure | before | after | change | noise | verdict |", "|---|---|---|---|---|---|---|"]
+    rows, cells = compare(before, after), []
     for r in rows:
         size = abs(r["before"]) or 1.0
         verdict = "inside the noise" if r["verdict"] == "same" else f"**{r['verdict']}**"
-        lines.append(
-            f"| {r['sequence']} | {r['title']} | {r['text'].format(r['before'])} | {r['text'].format(r['after'])} | "
-            f"{r['change'] / size:+.1%} | ±{r['noise'] / size:.1%} | {verdict} |"
+        values = [r["text"].format(r["before"]), r["text"].format(r["after"])]
+        cells.append(
+            [r["sequence"], r["title"], *values, f"{r['change'] / size:+.1%}", f"±{r['noise'] / size:.1%}", verdict]
         )
+    lines = [markdown_table(("sequence", "figure", "before", "after", "change", "noise", "verdict"), cells), ""]
     outside = [f"{r['sequence']} {r['title']} ({r['verdict']})" for r in rows if r["verdict"] != "same"]
-    lines += ["", *_machines(before, after), *differences_of_conditions(before, after)]
-    inside = len(rows) - len(outside)
+    lines += [_machines(before, after), *differences_of_conditions(before, after)]
     told = f"; outside it: {', '.join(outside)}" if outside else ""
-    lines += [f"{inside} of {len(rows)} differences lie inside the noise{told}"]
+    lines += [f"{len(rows) - len(outside)} of {len(rows)} differences lie inside the noise{told}"]
     return "\n".join(lines) + "\n"
 
 
@@ -222,25 +184,25 @@ def reference_of(record: dict[str, Any], clock: str) -> FloatArray:
     return np.array([r[clock] for r in record.get("references") or () if clock in r], dtype=np.float64)
 
 
-def _machines(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
+def _machines(before: dict[str, Any], after: dict[str, Any]) -> str:
     a, b = reference_of(before, "cpu_ms"), reference_of(after, "cpu_ms")
     if not len(a) or not len(b):
-        return ["no reference work in one of the records: times are compared as they are, the machine's speed included"]
-    return [
+        return "no reference work in one of the records: times are compared as they are, the machine's speed included"
+    return (
         f"machine: the reference work took {np.median(a):.1f} ms CPU ({a.min():.1f} to {a.max():.1f}), then "
         f"{np.median(b):.1f} ({b.min():.1f} to {b.max():.1f}); changes of times are at the first one's speed"
-    ]
+    )
 
 
-def _compared(before: dict[str, Any], after: dict[str, Any]) -> Iterator[tuple[str, Metric]]:
+def _compared(before: dict[str, Any], after: dict[str, Any]) -> Iterator[tuple[str, Figure]]:
     for name in sequences_of(before):
         if name in sequences_of(after):
             yield from ((name, metric) for metric in (*METRICS, *stage_metrics(before, name)))
     yield from ((ALONE, metric) for metric in alone_metrics(before))
 
 
-def _values(record: dict[str, Any], name: str, metric: Metric) -> tuple[FloatArray, FloatArray]:
-    """Values of a figure, and the reference work [ms] timed beside each (NaN without)."""
+def _levelled(record: dict[str, Any], name: str, metric: Figure) -> tuple[FloatArray, FloatArray]:
+    """Values of a figure as measured, and at the record's median machine speed."""
     kind, _, key = metric.name.partition(":")
     if kind in ("solver", "depth"):
         values = (record.get(kind) or {}).get(key)
@@ -250,47 +212,39 @@ def _values(record: dict[str, Any], name: str, metric: Metric) -> tuple[FloatArr
         runs = [r for r in record["runs"] if r["sequence"] == name]
         table, key = ("stages", key) if kind == "stage" else ("figures", metric.name)
         found = [((r.get(table) or {}).get(key), (r.get("reference") or {}).get(metric.clock)) for r in runs]
-    known = [(v, np.nan if r is None else r) for v, r in found if v is not None]
-    return np.array([v for v, _ in known], dtype=np.float64), np.array([r for _, r in known], dtype=np.float64)
-
-
-def _series(record: dict[str, Any], name: str, metric: Metric) -> _Series:
-    raw, level = _levelled(record, name, metric)
-    if not metric.clock:
-        scatter = float(np.std(raw, ddof=1) / abs(np.median(raw))) if len(raw) > 1 and np.median(raw) else 0.0
-        return _Series(raw, raw, scatter, float("nan"))
+    raw = np.array([v for v, _ in found if v is not None], dtype=np.float64)
+    beside = np.array([np.nan if r is None else r for v, r in found if v is not None], dtype=np.float64)
     references = reference_of(record, metric.clock)
-    middle = float(np.median(references)) if len(references) else float("nan")
-    groups = [level] if name == ALONE else [_levelled(record, n, metric)[1] for n in sequences_of(record)]
-    return _Series(raw, level, _pooled(groups, references), middle)
-
-
-def _levelled(record: dict[str, Any], name: str, metric: Metric) -> tuple[FloatArray, FloatArray]:
-    raw, beside = _values(record, name, metric)
-    references = reference_of(record, metric.clock) if metric.clock else np.zeros(0)
     if not len(references) or not np.isfinite(beside).all():
         return raw, raw
     factor = np.median(references) / beside
     return raw, raw * factor if metric.lower_is_better else raw / factor
 
 
-def _pooled(groups: Iterable[FloatArray], references: FloatArray) -> float:
-    """Relative scatter within groups of values; that of the reference work when no group has two."""
+def _scatter(record: dict[str, Any], name: str, metric: Figure, values: FloatArray) -> float:
+    """Standard deviation of levelled values; of times the pooled relative one of all sequences."""
+    if not metric.clock:
+        return scatter(values.tolist())
+    names = [name] if name == ALONE else sequences_of(record)
+    groups = [_levelled(record, n, metric)[1] for n in names]
     many = [g / np.mean(g) for g in groups if len(g) > 1 and np.mean(g) > 0]
-    freedom = sum(len(g) - 1 for g in many)
-    if freedom:
-        return float(np.sqrt(sum(float(np.sum((g - 1.0) ** 2)) for g in many) / freedom))
-    return float(np.std(references, ddof=1) / np.mean(references)) if len(references) > 1 else 0.0
+    references = reference_of(record, metric.clock)
+    if many:
+        squares = sum(float(np.sum((g - 1.0) ** 2)) for g in many)
+        relative = np.sqrt(squares / sum(len(g) - 1 for g in many))
+    else:
+        relative = np.std(references, ddof=1) / np.mean(references) if len(references) > 1 else 0.0
+    return float(relative) * abs(float(np.median(values)))
 
 
-def _chance(metric: Metric, a: _Series, b: _Series) -> float:
-    """Difference of two medians by chance, in the figure's unit."""
-    parts = [(s.scatter * abs(float(np.median(s.level)))) ** 2 / len(s.raw) for s in (a, b)]
-    return (_TIMED_SIGMAS if metric.clock else _SIGMAS) * float(np.sqrt(sum(parts)))
+def _chance(metric: Figure, sides: Sequence[FloatArray], scatters: Sequence[float]) -> float:
+    return chance([side.tolist() for side in sides], scatters, _TIMED_SIGMAS if metric.clock else SIGMAS)
 
 
-def _to_speed(metric: Metric, own_ms: float, other_ms: float) -> float:
-    """Factor that brings a figure from a machine of one speed to one of another."""
-    if not metric.clock or not np.isfinite(own_ms) or not np.isfinite(other_ms):
+def _to_speed(metric: Figure, own: dict[str, Any], other: dict[str, Any]) -> float:
+    """Factor that brings a figure from a record's machine speed to another's."""
+    own_ms, other_ms = (reference_of(record, metric.clock) for record in (own, other))
+    if not len(own_ms) or not len(other_ms):
         return 1.0
-    return other_ms / own_ms if metric.lower_is_better else own_ms / other_ms
+    factor = float(np.median(other_ms) / np.median(own_ms))
+    return factor if metric.lower_is_better else 1.0 / factor

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from edgeslam_torch.calibration.camera_choice import known_camera
-from edgeslam_torch.errors import CalibrationError, SourceError
+from edgeslam_torch.errors import CalibrationError, EdgeSlamError, SourceError
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import nearest
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
@@ -85,6 +85,32 @@ def open_depth(folder: Path | str) -> MeasuredDepth:
     if camera is None:
         raise EvaluationError(f"{folder}: the camera is not known; put a camera.yaml into the folder")
     return MeasuredDepth(depth, *_images(sequence), camera)
+
+
+def find_recordings(data: Path, min_frames: int = 30, min_hz: float = 0.0) -> dict[str, tuple[Path, FloatArray]]:
+    """Recordings with ground truth and images, by name: folder and stamps of the images.
+
+    ``data`` itself, its folders and theirs are looked at.
+
+    Raises:
+        EvaluationError: If ``data`` is no folder.
+    """
+    if not data.is_dir():
+        raise EvaluationError(f"{data}: no such folder of recordings (DATA, --data or EDGESLAM_DATA)")
+    found: dict[str, tuple[Path, FloatArray]] = {}
+    children = sorted(p for p in data.iterdir() if p.is_dir())
+    for folder in (data, *children, *(g for child in children for g in sorted(child.iterdir()) if g.is_dir())):
+        if any(folder.is_relative_to(other) for other, _ in found.values()):  # a part of a recording
+            continue
+        try:
+            dataset = open_dataset(folder)
+        except EdgeSlamError:
+            continue
+        stamps = dataset.frame_stamps_s
+        if len(stamps) >= max(min_frames, 2) and min_hz * float(np.median(np.diff(stamps))) <= 1.0:
+            name = dataset.name if dataset.name not in found else f"{folder.parent.name}_{dataset.name}"
+            found[name] = (folder, stamps)
+    return {name: (folder.resolve(), stamps) for name, (folder, stamps) in found.items()}
 
 
 def interpolate(trajectory: Trajectory, stamps_s: FloatArray) -> tuple[FloatArray, np.ndarray]:

@@ -1,40 +1,27 @@
-"""Cells of the judge: one source with one seed each."""
+"""Cells of the judge: one source with one seed each. `cases.toml` has what is special to a recording."""
 
+import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.dataset import open_dataset
+from edgeslam_torch.eval.inputs.dataset import find_recordings
 from edgeslam_torch.eval.judge import sources
 from edgeslam_torch.eval.judge.flights import NONE
-from edgeslam_torch.eval.judge.telemetry.simulated_telemetry import KINDS
+from edgeslam_torch.eval.judge.simulated_telemetry import KINDS
 from edgeslam_torch.readers.source import Recording
 from edgeslam_torch.synthetic.flights.courses import COURSES
 
 SETS = ("base", "variants", "flights", "telemetry", "all")
-"""What ``--set`` takes: recordings as they are, their variants, simulations, telemetry along them, everything."""
-
+"""Recordings as they are, their variants, simulations, telemetry along recordings, everything."""
+CASES: dict[str, Any] = tomllib.loads(Path(__file__).with_name("cases.toml").read_text(encoding="utf-8"))
 MIN_FRAMES = 30
 """Shorter recordings, and variants that leave fewer, are not judged."""
-
-KIDNAP = ((0, 250), (420, 600), (100, 250))
-"""Frames of `KIDNAPPED`: away from a place without warning, and back to it."""
-KIDNAPPED = "7scenes_redkitchen"
-SECOND_FLIGHT = "second_flight"
-"""Variant with two flights: the first saves its map, the second starts with it. Of `KIDNAPPED` the first and the second
-`HALF` frames, of a simulation two paths through one world."""
-HALF = 300
-CUT, CUT_FRAMES = "cut", 160
-"""Variant that joins this many frames of a simulation and of the next seed's: two places, two submaps."""
-CUT_COURSES = ("room", "corridor")
-FLOWN_AGAIN = ("room", "building")
-"""Courses with a second flight: from another place, and from the first take-off."""
-WITH_TELEMETRY = ("tum_fr1_xyz", "7scenes_redkitchen", "euroc_mh05_a", "tartan_hospital")
-"""Recordings with simulated telemetry."""
+BACKWARDS, KIDNAP, SECOND_FLIGHT, CUT = "backwards", "kidnap", "second_flight", "cut"
+"""Variants of their own: played from the end (nothing was tuned on it); cut; two flights with one map; two worlds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,15 +47,10 @@ class Variant:
         """The recording, changed; ``seed`` is the draw of a perturbation."""
         if self.perturb_px:
             recording = sources.perturbed(recording, seed, self.perturb_px)
-        if self.first:
-            recording = sources.start_at(recording, self.first)
-        if self.rate > 1:
-            recording = sources.every(recording, self.rate)
+        recording = sources.part(recording, self.first, self.rate)
         if self.shrink > 1:
             recording = sources.smaller(recording, self.shrink)
-        if self.focal != 1.0:
-            recording = sources.with_focal_length(recording, self.focal)
-        return recording
+        return sources.with_focal_length(recording, self.focal)
 
 
 VARIANTS = {
@@ -84,9 +66,6 @@ VARIANTS = {
 }
 """Names after the slash in a cell's name."""
 
-BACKWARDS = "backwards"
-"""The variant that plays a recording from its end: an independent check, since nothing was tuned on it."""
-
 
 @dataclass(frozen=True, slots=True)
 class Cell:
@@ -99,13 +78,13 @@ class Cell:
     folder: str = ""
     """Folder of the recording."""
     variant: str = ""
-    """A name in `VARIANTS`, `BACKWARDS`, ``kidnap``, `CUT` or `SECOND_FLIGHT`."""
+    """A name in `VARIANTS`, or a variant of its own."""
     course: str = ""
     """Course of a simulated flight: a name in `courses.COURSES`."""
     nothing: str = ""
     """Source without usable images: a name in `flights.NONE`."""
     telemetry: str = ""
-    """Simulated telemetry: a name in `telemetry.simulated_telemetry.KINDS`."""
+    """Simulated telemetry: a name in `simulated_telemetry.KINDS`."""
 
     @property
     def base(self) -> str:
@@ -120,35 +99,6 @@ class Cell:
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return asdict(self)
-
-
-def find_recordings(data: Path) -> dict[str, tuple[Path, int]]:
-    """Folders with a known layout, ground truth and images, and their numbers of frames, by name.
-
-    ``data`` itself, its folders and theirs are looked at.
-
-    Raises:
-        EvaluationError: If ``data`` is no folder.
-    """
-    if not data.is_dir():
-        raise EvaluationError(f"{data}: no such folder of recordings (DATA or EDGESLAM_DATA)")
-    found: dict[str, tuple[Path, int]] = {}
-    for folder in (data, *_folders(data)):
-        if any(folder.is_relative_to(other) for other, _ in found.values()):
-            continue
-        try:
-            dataset = open_dataset(folder)
-        except EdgeSlamError:
-            continue
-        if len(dataset.frame_stamps_s) >= MIN_FRAMES:
-            name = dataset.name if dataset.name not in found else f"{folder.parent.name}_{dataset.name}"
-            found[name] = (folder.resolve(), len(dataset.frame_stamps_s))
-    return found
-
-
-def _folders(data: Path) -> list[Path]:
-    children = sorted(p for p in data.iterdir() if p.is_dir())
-    return [*children, *(g for child in children for g in sorted(child.iterdir()) if g.is_dir())]
 
 
 def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequence[str] = ()) -> list[Cell]:
@@ -166,31 +116,25 @@ def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequen
     if which not in SETS:
         raise EvaluationError(f"no set {which!r}; there are {', '.join(SETS)}")
     made: list[Cell] = []
-    recordings = find_recordings(data) if data is not None else {}
-    for name, (folder, frames) in recordings.items():
-        variants = [v for v, change in VARIANTS.items() if change.frames_of(frames) >= MIN_FRAMES]
-        variants.append(BACKWARDS)
-        wanted = ([""] if which in ("base", "all") else []) + (variants if which in ("variants", "all") else [])
-        wanted += ["kidnap"] if which in ("flights", "all") and _can_kidnap(name, frames) else []
-        wanted += [SECOND_FLIGHT] if which in ("flights", "all") and _can_kidnap(name, frames) else []
-        made += [_cell(name, folder, variant) for variant in wanted]
-        if which in ("telemetry", "all") and name in WITH_TELEMETRY:
+    recordings = find_recordings(data, MIN_FRAMES) if data is not None else {}
+    for name, (folder, stamps_s) in recordings.items():
+        frames, wanted = len(stamps_s), [""] if which in ("base", "all") else []
+        if which in ("variants", "all"):
+            wanted += [*(v for v, change in VARIANTS.items() if change.frames_of(frames) >= MIN_FRAMES), BACKWARDS]
+        if which in ("flights", "all"):
+            segments, half = CASES[KIDNAP].get(name), CASES[SECOND_FLIGHT].get(name)
+            wanted += [KIDNAP] if segments and frames >= max(last for _, last in segments) else []
+            wanted += [SECOND_FLIGHT] if half and frames >= 2 * half else []
+        made += [Cell(f"{name}/{variant}" if variant else name, 0, str(folder), variant) for variant in wanted]
+        if which in ("telemetry", "all") and name in CASES["telemetry"]:
             made += [Cell(f"telemetry/{kind}/{name}", 0, str(folder), telemetry=kind) for kind in KINDS]
     if which in ("flights", "all"):
         made += [Cell(f"flight/{course}", 0, course=course) for course in COURSES]
-        made += [Cell(f"flight/{c}/{SECOND_FLIGHT}", 0, variant=SECOND_FLIGHT, course=c) for c in FLOWN_AGAIN]
-        made += [Cell(f"flight/{course}/{CUT}", 0, variant=CUT, course=course) for course in CUT_COURSES]
+        for variant, courses in CASES["courses"].items():
+            made += [Cell(f"flight/{course}/{variant}", 0, variant=variant, course=course) for course in courses]
         made += [Cell(f"none/{kind}", 0, nothing=kind) for kind in NONE]
     kept = [cell for cell in made if not only or any(fnmatchcase(cell.name, pattern) for pattern in only)]
     if not kept:
         there = ", ".join(dict.fromkeys(cell.name for cell in made)) or "none (no recordings: DATA or EDGESLAM_DATA)"
         raise EvaluationError(f"no cell matches; there are: {there}")
     return [replace(cell, seed=seed) for cell in kept for seed in seeds]
-
-
-def _can_kidnap(name: str, frames: int) -> bool:
-    return name == KIDNAPPED and frames >= max(last for _, last in KIDNAP)
-
-
-def _cell(name: str, folder: Path, variant: str) -> Cell:
-    return Cell(f"{name}/{variant}" if variant else name, 0, str(folder), variant)

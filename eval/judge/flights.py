@@ -1,7 +1,5 @@
-"""``python -m edgeslam_torch.eval.judge.flights COURSE SEED FOLDER``: record a simulated flight, once for all judges.
-
-A process of its own, so that drawing the pictures does not count as the judged run's memory.
-"""
+"""``python -m edgeslam_torch.eval.judge.flights COURSE SEED FOLDER FLIGHT``: record a simulated flight, once for all
+judges; a process of its own, so that drawing the pictures does not count as the judged run's memory."""
 
 import hashlib
 import subprocess
@@ -19,7 +17,6 @@ from edgeslam_torch.readers.source import Recording
 from edgeslam_torch.synthetic.flights.courses import (
     COURSES,
     RATE_HZ,
-    Course,
     flown,
     record_course,
     record_flight,
@@ -46,15 +43,8 @@ def flight_folder(root: Path, course: str, seed: int, flight: int = 0) -> Path:
     """
     folder = root / f"{course}-s{seed}{f'-f{flight}' if flight else ''}-{_simulator()}"
     if not folder.is_dir():
-        command = [
-            sys.executable,
-            "-m",
-            "edgeslam_torch.eval.judge.flights",
-            course,
-            str(seed),
-            str(folder),
-            str(flight),
-        ]
+        words = [course, str(seed), str(folder), str(flight)]
+        command = [sys.executable, "-m", "edgeslam_torch.eval.judge.flights", *words]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise EvaluationError(f"{course}, seed {seed}: could not be recorded: {done.stderr.strip()[-300:]}")
@@ -66,16 +56,17 @@ def nothing_to_see(kind: str, seed: int) -> Recording:
     camera = simulated_camera()
     shape = (camera.height, camera.width, 3)
     if kind == "noise":
-        return made_of(lambda i: _noise([seed, i], shape), NONE_FRAMES, camera, RATE_HZ)
-    if kind == "black":
-        return made_of(lambda _: np.zeros(shape, np.uint8), NONE_FRAMES, camera, RATE_HZ)
-    world, flight, _ = flown(COURSES["room"], seed, seconds=5.0)
-    picture = render(world, camera, flight.T_w_c[-1]).image
+        return made_of(
+            lambda i: np.random.default_rng([seed, i]).integers(0, 256, shape, dtype=np.uint8),
+            NONE_FRAMES,
+            camera,
+            RATE_HZ,
+        )
+    picture = np.zeros(shape, np.uint8)
+    if kind == "frozen":
+        world, flight, _ = flown(COURSES["room"], seed, seconds=5.0)
+        picture = render(world, camera, flight.T_w_c[-1]).image
     return made_of(lambda _: picture, NONE_FRAMES, camera, RATE_HZ)
-
-
-def _noise(seed: list[int], shape: tuple[int, ...]) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
 @lru_cache(maxsize=1)
@@ -87,10 +78,10 @@ def _simulator() -> str:
     return digest.hexdigest()[:8]
 
 
-def _record_again(folder: Path, course: Course, seed: int, flight: int) -> None:
+def _record_again(folder: Path, name: str, seed: int, flight: int) -> None:
     """Another flight through the world of a course."""
-    world = course.world(np.random.default_rng(seed))
-    rng = np.random.default_rng([seed, flight])
+    course = COURSES[name]
+    world, rng = course.world(np.random.default_rng(seed)), np.random.default_rng([seed, flight])
     flown_again = course.pilot(rng, world, round(course.seconds * course.rate_hz), rate_hz=course.rate_hz)
     camera = simulated_camera()
     record_flight(folder, world, flown_again, rng, camera, course.telemetry, course.faults, seed=seed + flight)
@@ -103,7 +94,7 @@ def main(course: str, seed: int, folder: Path, flight: int = 0) -> int:
         if flight == 0:
             record_course(part, COURSES[course], seed)
         else:
-            _record_again(part, COURSES[course], seed, flight)
+            _record_again(part, course, seed, flight)
         try:
             part.rename(folder)
         except OSError:

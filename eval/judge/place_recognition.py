@@ -32,9 +32,8 @@ from edgeslam_torch.atlas.place_recognition import revisit_candidates
 from edgeslam_torch.atlas.saved import SavedAtlas, unpack
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import EdgeSlamError
-from edgeslam_torch.eval.inputs.dataset import interpolate, open_dataset
+from edgeslam_torch.eval.inputs.dataset import find_recordings, interpolate, open_dataset
 from edgeslam_torch.eval.judge import sources
-from edgeslam_torch.eval.judge.cells import find_recordings
 from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.geometry import se3, sim3
@@ -107,7 +106,7 @@ def fly_half(folder: Path, name: str, half: int, out: Path) -> Half:
         source = open_source(folder)
         assert isinstance(source, Recording)
         middle = (source.length or 0) // 2
-        source = sources.first_frames(source, middle) if half == 0 else sources.start_at(source, middle)
+        source = sources.part(source, middle) if half else sources.part(source, count=middle)
         atlas, stamps = _flown(source, name)
         write_atlas(file, atlas)
         write_atomically(stamps_file, lambda file: np.save(file, stamps))

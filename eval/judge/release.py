@@ -12,30 +12,16 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch import __version__
-from edgeslam_torch.eval.benchmark.conditions import machine
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.judge.cells import Cell, find_recordings, list_cells
+from edgeslam_torch.eval.experiment.conditions import machine
+from edgeslam_torch.eval.inputs.dataset import find_recordings
+from edgeslam_torch.eval.judge.cells import CASES, Cell, list_cells
 from edgeslam_torch.eval.judge.thresholds import Row
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.record_files import read_mapping
 
-RUNS = {
-    "tum_fr1_xyz": 3,
-    "7scenes_redkitchen": 3,
-    "tum_fr1_rpy_depth": 3,
-    "euroc_mh05_a": 3,
-    "fr3_notexture_a": 3,
-    "hololens_a/perturbed": 8,
-    "tartan_hospital/perturbed": 8,
-    "telemetry/rounded/tum_fr1_xyz": 3,
-    "telemetry/rounded/7scenes_redkitchen": 3,
-    "telemetry/rounded/euroc_mh05_a": 3,
-    "telemetry/rounded/tartan_hospital": 3,
-    "flight/room": 3,
-    "flight/corridor": 3,
-    "flight/block": 1,
-}
-"""Cells with their number of seeds; of recordings on which chance decides, starts and calibrations are perturbed."""
+RUNS: dict[str, int] = CASES["release"]
+"""Cells with their number of seeds."""
 
 COMMANDS = {
     "demo": "edgeslam demo --out runs/demo",

@@ -1,10 +1,5 @@
-"""``python -m edgeslam_torch.eval.judge.run_cell FOLDER``: run and judge the cell that ``FOLDER/cell.json`` describes.
+"""A cell's run and its figures: what the process of a cell does."""
 
-In a separate process, so that failures are isolated and memory and CPU time are measurable.
-"""
-
-import json
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -13,65 +8,67 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.benchmark.machine_speed import orb_pass_ms
+from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import interpolate, open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.eval.judge import flights, second_flight, sources
-from edgeslam_torch.eval.judge.cells import BACKWARDS, CUT, CUT_FRAMES, HALF, KIDNAP, SECOND_FLIGHT, VARIANTS, Cell
-from edgeslam_torch.eval.judge.runner import CELL, RESULT
+from edgeslam_torch.eval.judge.cells import BACKWARDS, CASES, CUT, KIDNAP, SECOND_FLIGHT, VARIANTS, Cell
 from edgeslam_torch.eval.judge.score import Truth, score
-from edgeslam_torch.eval.judge.telemetry.simulated_telemetry import KINDS, Drawn
-from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.eval.judge.simulated_telemetry import KINDS, Drawn
 from edgeslam_torch.files.config_file import load_config
-from edgeslam_torch.jobs.watched import end_with_parent
 from edgeslam_torch.readers.layouts import read_sequence
 from edgeslam_torch.readers.source import Recording, open_source
-from edgeslam_torch.run import run, settle_camera
+from edgeslam_torch.run import AtlasFiles, RunResult, run, settle_camera
 from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ
-from edgeslam_torch.types import FloatArray
 
-RUN = "run"
+RUN, FIRST, ATLAS = "run", "first", "first.atlas"
+"""In a cell's folder: its run; of two flights, the first one's run and map."""
+CUT_FRAMES = 160
+"""Of either world."""
 
 
-def main(folder: Path) -> int:
-    """Write ``result.json`` to the folder; on failure the last line on stderr gives the reason."""
+def run_cell(case: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Figures and notes of the cell that ``case`` describes; its run is left in ``folder``.
+
+    Raises:
+        EdgeSlamError: If it cannot be run or evaluated.
+    """
     begin_s = time.monotonic()
-    spec: dict[str, Any] = json.loads((folder / CELL).read_text(encoding="utf-8"))
-    cell = Cell(**spec["cell"])
-    config = load_config(replace(SlamConfig(), seed=cell.seed), None, spec["overrides"])
+    cell = Cell(**case["cell"])
+    config = load_config(replace(SlamConfig(), seed=cell.seed), None, case["overrides"])
     begin_cpu_s = time.process_time()
     before_ms = orb_pass_ms()
     timing_s = time.process_time() - begin_cpu_s
-    try:
-        source, truth = _opened(cell, folder, Path(spec["flights"]))
-        if spec["max_frames"] is not None:
-            source = sources.first_frames(source, spec["max_frames"])
-        if cell.variant == SECOND_FLIGHT:
-            first, first_truth = _first_flight(cell, Path(spec["flights"]))
-            second_flight.fly_first(first, folder, config)
-            result = second_flight.fly_second(source, folder / RUN, folder, config)
-        else:
-            settle_camera(source)
-            result = run(source, folder / RUN, config)
-        cpu_ms = 1e3 * (time.process_time() - timing_s) / max(result.summary["frames"], 1)
-        orb_ms = (before_ms + orb_pass_ms()) / 2
-        if result.interrupted or result.failure is not None:
-            sys.stderr.write(f"{result.failure or 'interrupted'}\n")
-            return 1
-        figures, notes = score(folder / RUN, truth)
-        figures |= {"cpu_ms": cpu_ms, "orb_ms": orb_ms, "cpu_orb": cpu_ms / orb_ms}
-        if cell.variant == SECOND_FLIGHT:
-            figures |= second_flight.compared(folder / RUN, truth, folder / second_flight.FIRST, first_truth)
-    except EdgeSlamError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
+    source, truth = opened(cell, folder, Path(case["flights"]))
+    source = sources.part(source, count=case["max_frames"])
+    earlier = AtlasFiles()
+    if cell.variant == SECOND_FLIGHT:
+        from edgeslam_torch.atlas.atlas_file import read_atlas
+
+        first, first_truth = _first_flight(cell, Path(case["flights"]))
+        _flown(first, folder / FIRST, config, AtlasFiles(save=folder / ATLAS))
+        earlier = AtlasFiles(load=read_atlas(folder / ATLAS))
+    result = _flown(source, folder / RUN, config, earlier)
+    cpu_ms = 1e3 * (time.process_time() - timing_s) / max(result.summary["frames"], 1)
+    orb_ms = (before_ms + orb_pass_ms()) / 2
+    figures, notes = score(folder / RUN, truth)
+    figures |= {"cpu_ms": cpu_ms, "orb_ms": orb_ms, "cpu_orb": cpu_ms / orb_ms}
+    if cell.variant == SECOND_FLIGHT:
+        figures |= second_flight.compared(folder / RUN, truth, folder / FIRST, first_truth)
     figures["took_s"] = time.monotonic() - begin_s
-    write_text(folder / RESULT, json.dumps({"key": spec["key"], "figures": figures, "notes": notes}, indent=1) + "\n")
-    return 0
+    return {"figures": figures, "notes": notes}
 
 
-def _opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Truth]:
+def _flown(source: Recording, out: Path, config: SlamConfig, atlas: AtlasFiles) -> RunResult:
+    settle_camera(source)
+    result = run(source, out, config, atlas=atlas)
+    if result.interrupted or result.failure is not None:
+        raise EvaluationError(result.failure or "interrupted")
+    return result
+
+
+def opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Truth]:
     """The cell's source and what its run is compared with."""
     if cell.nothing:
         return flights.nothing_to_see(cell.nothing, cell.seed), Truth(None)
@@ -80,15 +77,16 @@ def _opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tr
         return sources.followed_by(_recording(here), _recording(there), CUT_FRAMES, RATE_HZ), Truth(None)
     if cell.course:
         place = flights.flight_folder(flights_root, cell.course, cell.seed, int(cell.variant == SECOND_FLIGHT))
-        return _recording(place), Truth(place, surfaces=lambda p: _distances(cell, p))
+        world = COURSES[cell.course].world
+        return _recording(place), Truth(
+            place, surfaces=lambda p_w: world(np.random.default_rng(cell.seed)).distance_to_surface(p_w)
+        )
     place = Path(cell.folder)
     source = _recording(place)
-    if cell.variant == "kidnap":
-        return _kidnapped(source, place, folder / "groundtruth.txt")
-    if cell.variant == BACKWARDS:
-        return _backwards(source, place, folder / "groundtruth.txt")
+    if cell.variant in (KIDNAP, BACKWARDS):
+        return _reordered(cell, source, folder / "groundtruth.txt")
     if cell.variant == SECOND_FLIGHT:
-        return sources.start_at(source, HALF), Truth(place)
+        return sources.part(source, CASES[SECOND_FLIGHT][cell.base]), Truth(place)
     dataset = open_dataset(place)
     if cell.telemetry:
         drawn = Drawn(dataset.truth, dataset.frame_stamps_s, cell.seed)
@@ -102,7 +100,8 @@ def _first_flight(cell: Cell, flights_root: Path) -> tuple[Recording, Truth]:
     if cell.course:
         place = flights.flight_folder(flights_root, cell.course, cell.seed)
         return _recording(place), Truth(place)
-    return sources.first_frames(_recording(Path(cell.folder)), HALF), Truth(Path(cell.folder))
+    source = _recording(Path(cell.folder))
+    return sources.part(source, count=CASES[SECOND_FLIGHT][cell.base]), Truth(Path(cell.folder))
 
 
 def _recording(place: Path) -> Recording:
@@ -111,31 +110,15 @@ def _recording(place: Path) -> Recording:
     return source
 
 
-def _distances(cell: Cell, p_w: FloatArray) -> FloatArray:
-    """Distances ``(N,)`` of points to the surfaces of a simulated flight's world, built anew."""
-    return COURSES[cell.course].world(np.random.default_rng(cell.seed)).distance_to_surface(p_w)
-
-
-def _kidnapped(source: Recording, place: Path, truth_file: Path) -> tuple[Recording, Truth]:
-    """The cut recording, with its ground truth cut the same way into a file."""
-    dataset = open_dataset(place)
-    plan = sources.Cut(KIDNAP, dataset.frame_stamps_s)
-    T_w_c, known = interpolate(dataset.truth, dataset.frame_stamps_s[plan.originals])
-    write_tum(Trajectory(plan.new_stamps_s[known], T_w_c[known]), truth_file)
-    return sources.cut(source, plan), Truth(truth_file)
-
-
-def _backwards(source: Recording, place: Path, truth_file: Path) -> tuple[Recording, Truth]:
-    """The reversed recording, with its ground truth reversed the same way into a file."""
-    sequence = read_sequence(place)
+def _reordered(cell: Cell, source: Recording, truth_file: Path) -> tuple[Recording, Truth]:
+    """The images in another order, with their ground truth in the same order in a file."""
+    sequence = read_sequence(Path(cell.folder))
     assert sequence is not None, "a recording with truth has a layout"
     stamps_s = np.array([entry.stamp_s for entry in sequence.images])
-    T_w_c, known = interpolate(open_dataset(place).truth, stamps_s)
-    turned = sources.mirrored_stamps_s(stamps_s)[known]
-    write_tum(Trajectory(turned[::-1], T_w_c[known][::-1]), truth_file)
-    return sources.backwards(source, sequence.images), Truth(truth_file)
-
-
-if __name__ == "__main__":
-    end_with_parent()
-    sys.exit(main(Path(sys.argv[1])))
+    if cell.variant == BACKWARDS:
+        order, played_s = sources.backwards(stamps_s)
+    else:
+        order, played_s = sources.cut(stamps_s, CASES[KIDNAP][cell.base])
+    T_w_c, known = interpolate(open_dataset(Path(cell.folder)).truth, stamps_s[order])
+    write_tum(Trajectory(played_s[known], T_w_c[known]), truth_file)
+    return sources.reordered(source, sequence.images, order, played_s), Truth(truth_file)

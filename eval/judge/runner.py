@@ -1,24 +1,20 @@
-"""Runs cells in separate processes, some at a time; an interrupted judge resumes."""
+"""The judge: all cells in processes of their own, and one record of their figures; an interrupted judge resumes."""
 
-import json
-import subprocess
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from edgeslam_torch import __version__
-from edgeslam_torch.eval.benchmark.conditions import code_state
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.experiment.conditions import code_state
+from edgeslam_torch.eval.experiment.runner import CASE, Local, Runner, Task, run_tasks
 from edgeslam_torch.eval.judge.cells import Cell
-from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.files.plain import subfolder
 from edgeslam_torch.files.record_files import read_mapping
-from edgeslam_torch.jobs.watched import Job, Limits, Start, run_each, start_module
+from edgeslam_torch.jobs.watched import Limits
 
-CELL, RESULT, LOG = "cell.json", "result.json", "log.txt"
+RECORD = "judge.json"
 FORMAT = 1
 """Of the record."""
 
@@ -44,7 +40,7 @@ def judge(
     out: Path,
     say: Callable[[str], None],
     commit: str | None = None,
-    start: Start | None = None,
+    runner: Runner | None = None,
 ) -> dict[str, Any]:
     """Run the cells without a result in ``out``, and gather all results.
 
@@ -54,35 +50,31 @@ def judge(
         out: Folder for the cells' own folders.
         say: Called with one line for every finished cell.
         commit: State of the code; read from git when None. A result of another state is not taken.
-        start: Starts a cell's process; `start_cell` when None.
+        runner: `Local` when None.
 
     Returns:
         The record: conditions, and a row for every cell with its figures, or with the reason why it has none; the
         cells that an earlier call with the same code and settings left in ``out`` are among them.
     """
     commit = code_state() if commit is None else commit
-    start = start or start_cell
+    flights = settings.flights or out / "flights"
+    flights.mkdir(parents=True, exist_ok=True)
+
+    def task(cell: Cell) -> Task:
+        case = {"commit": commit, "overrides": list(settings.overrides), "max_frames": settings.max_frames}
+        case |= {"cell": cell.to_dict()}
+        return Task(
+            out / "cells", cell.slug, "edgeslam_torch.eval.judge.run_cell:run_cell", case, {"flights": str(flights)}
+        )
+
+    runner = runner or Local(settings.jobs, Limits(settings.timeout_s))
     rows: dict[Cell, dict[str, Any]] = {}
-    waiting: list[Cell] = []
-    for cell in cells:
-        found = _result(out / "cells" / cell.slug, _key(cell, settings, commit))
-        if found is None:
-            waiting.append(cell)
-        else:
-            rows[cell] = _row(cell, found)
-    if rows:
-        say(f"{len(rows)} of {len(cells)} cells were done before")
-    limits = Limits(settings.timeout_s)
-
-    def begin(cell: Cell) -> Job:
-        folder = _prepared(cell, settings, commit, out)
-        return Job(folder, folder / LOG, start, limits)
-
-    with closing(run_each(waiting, begin, settings.jobs)) as ends:
-        for cell, ended in ends:
-            found = _result(out / "cells" / cell.slug, _key(cell, settings, commit))
-            rows[cell] = _row(cell, {"error": ended.reason} if found is None else found)
+    for cell, found, ended in run_tasks({cell: task(cell) for cell in cells}, runner):
+        rows[cell] = _row(cell, found or {"error": ended.reason if ended is not None else ""})
+        if ended is not None:
             say(f"[{len(rows)}/{len(cells)}] {_one_line(rows[cell])}")
+    others = [cell for cell in _cells_in(out) if cell not in rows]
+    rows |= {cell: _row(cell, found) for cell in others if (found := task(cell).result()) is not None}
     return {
         "format": FORMAT,
         "version": __version__,
@@ -90,8 +82,22 @@ def judge(
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "overrides": list(settings.overrides),
         "max_frames": settings.max_frames,
-        "rows": sorted([*rows.values(), *_others(cells, settings, out, commit)], key=_order),
+        "rows": sorted(rows.values(), key=_order),
     }
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """The record in a judge's output folder.
+
+    Raises:
+        EvaluationError: If there is none.
+    """
+    path = folder / RECORD
+    record = read_mapping(path, "JSON", EvaluationError)
+    rows = record.get("rows")
+    if record.get("format") != FORMAT or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise EvaluationError(f"{path}: not a result of 'edgeslam judge' (format {FORMAT})")
+    return record
 
 
 def _order(row: dict[str, Any]) -> tuple[bool, str, int]:
@@ -99,54 +105,15 @@ def _order(row: dict[str, Any]) -> tuple[bool, str, int]:
     return row["cell"].startswith(("flight/", "none/", "telemetry/")), row["cell"], row["seed"]
 
 
-def start_cell(folder: Path, log: IO[str]) -> subprocess.Popen[str]:
-    """The process that runs a cell's folder."""
-    return start_module("edgeslam_torch.eval.judge.run_cell", folder, log)
-
-
-def _key(cell: Cell, settings: JudgeSettings, commit: str) -> str:
-    """Everything that determines a cell's result."""
-    return json.dumps([commit, list(settings.overrides), settings.max_frames, cell.to_dict()])
-
-
-def _result(folder: Path, key: str) -> dict[str, Any] | None:
-    """The result in a cell's folder, if it is whole and has this key."""
-    try:
-        found = read_mapping(folder / RESULT, "JSON", EvaluationError)
-    except EvaluationError:
-        return None
-    return found if found.get("key") == key else None
-
-
-def _others(cells: Sequence[Cell], settings: JudgeSettings, out: Path, commit: str) -> list[dict[str, Any]]:
-    """Rows of results in ``out`` of the same code and settings, of cells not requested now."""
-    rows = []
-    for path in sorted((out / "cells").glob(f"*/{CELL}")):
+def _cells_in(out: Path) -> list[Cell]:
+    """Cells with a folder in ``out``."""
+    cells = []
+    for path in sorted((out / "cells").glob(f"*/{CASE}")):
         try:
-            cell = Cell(**read_mapping(path, "JSON", EvaluationError)["cell"])
+            cells.append(Cell(**read_mapping(path, "JSON", EvaluationError)["cell"]))
         except (TypeError, KeyError, ValueError) as error:
             raise EvaluationError(f"{path}: no cell of a judge ({error}); give another --out") from error
-        found = _result(path.parent, _key(cell, settings, commit))
-        if cell not in cells and found is not None:
-            rows.append(_row(cell, found))
-    return rows
-
-
-def _prepared(cell: Cell, settings: JudgeSettings, commit: str, out: Path) -> Path:
-    """The cell's folder, with what its process has to do and no result."""
-    folder = subfolder(out, "cells", cell.slug)
-    (folder / RESULT).unlink(missing_ok=True)
-    flights = settings.flights or out / "flights"
-    flights.mkdir(parents=True, exist_ok=True)
-    spec = {
-        "key": _key(cell, settings, commit),
-        "cell": cell.to_dict(),
-        "overrides": settings.overrides,
-        "max_frames": settings.max_frames,
-        "flights": str(flights),
-    }
-    write_text(folder / CELL, json.dumps(spec, indent=1) + "\n")
-    return folder
+    return cells
 
 
 def _row(cell: Cell, found: dict[str, Any]) -> dict[str, Any]:

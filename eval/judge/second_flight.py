@@ -1,38 +1,28 @@
-"""Cell of two flights: the first saves its map, the second starts with it and is scored.
+"""Two flights, of which the second starts with the map of the first: time to relocalise, agreement of both scales.
 
-Scored are the time to relocalise and the agreement of both scales. A second flight may start outside the first map, so
-depth maps determine when a known place comes into view. The scale is measured by depth maps as well as by path lengths,
-since bending of map or ground truth changes the latter by some per cent.
+A second flight may start outside the first map, so depth maps determine when a known place comes into view. The scale
+is measured by depth maps as well as by path lengths, since bending of map or ground truth changes the latter by some
+per cent.
 """
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import interpolate, open_dataset, open_depth
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, open_run
 from edgeslam_torch.eval.judge.score import Figures, Truth, score
-from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.readers.source import Recording
-from edgeslam_torch.run import AtlasFiles, RunResult, run, settle_camera
 from edgeslam_torch.types import FloatArray
 
-FIRST = "first"
-"""Folder of the first flight's run."""
-ATLAS = "first.atlas"
 NEVER_S = 1e3
 """Stands for a place that is never recognised."""
-VIEWS_S = 0.5
-"""Time between the views that are compared."""
-GRID_PX = 16
-"""Distance of the pixels that are compared."""
+VIEWS_S, GRID_PX = 0.5, 16
+"""Time between the views, and distance of the pixels, that are compared."""
 KNOWN_SHARE, KNOWN_RAD, KNOWN_RATIO = 0.5, np.deg2rad(20.0), 1.5
 """A view is known when this share of it was in one view of the first flight within this angle and ratio of distances,
 the limits of keypoint matching."""
@@ -42,28 +32,8 @@ SAME_UNIT = 0.15
 """The same while a map's scale is estimated."""
 
 
-def fly_first(source: Recording, folder: Path, config: SlamConfig) -> RunResult:
-    """Run the first flight and save its map in ``folder``."""
-    settle_camera(source)
-    return run(source, folder / FIRST, config, atlas=AtlasFiles(save=folder / ATLAS))
-
-
-def fly_second(source: Recording, out: Path, folder: Path, config: SlamConfig) -> RunResult:
-    """Run the second flight with the map of the first."""
-    from edgeslam_torch.atlas.atlas_file import read_atlas
-
-    settle_camera(source)
-    return run(source, out, config, atlas=AtlasFiles(load=read_atlas(folder / ATLAS)))
-
-
 def compared(second: Path, truth: Truth, first: Path, first_truth: Truth) -> Figures:
-    """Figures of the second flight beside those of any run.
-
-    Args:
-        second: Its run.
-        truth: What it is compared with.
-        first: Run of the first flight.
-        first_truth: The same of that one.
+    """Figures of the second flight's run beside the first one's.
 
     Returns:
         ``placed_after_s`` until the first frame in the map of the first flight, ``placed`` share of frames in it,
@@ -71,17 +41,35 @@ def compared(second: Path, truth: Truth, first: Path, first_truth: Truth) -> Fig
         ``metres_off_depth`` by depth maps; ``known_after_s`` until the first view that the first flight knew, and
         ``placed_late_s`` from then on, 0 when it never came.
     """
-    summary: dict[str, Any] = read_mapping(second / "summary.json", "JSON", EvaluationError)
-    found = summary["atlas"]
-    after = found["found_after_s"]
-    scales = [score(run, its)[0].get("scale_sim3") for run, its in ((first, first_truth), (second, truth))]
-    known = [s for s in scales if s]
-    return {
-        "placed_after_s": NEVER_S if after is None else after,
-        "placed": found["frames_placed"] / max(summary["frames"], 1),
-        "metres_off": abs(math.log(known[1] / known[0])) if len(known) == 2 else None,
-        **_by_depth_maps(open_run(second), truth, open_run(first), first_truth, NEVER_S if after is None else after),
+    runs, truths = (open_run(first), open_run(second)), (first_truth, truth)
+    found = runs[1].summary["atlas"]
+    after_s = NEVER_S if found["found_after_s"] is None else found["found_after_s"]
+    scales = [score(run.path, its)[0].get("scale_sim3") for run, its in zip(runs, truths, strict=True)]
+    figures: Figures = {
+        "placed_after_s": after_s,
+        "placed": found["frames_placed"] / max(runs[1].summary["frames"], 1),
+        "metres_off": _ratio(scales),
     }
+    views = [views_of(run, its.poses) if its.poses is not None else [] for run, its in zip(runs, truths, strict=True)]
+    if not all(views):
+        return figures
+    known_s = known_after_s([view for _, view in views[0]], views[1], float(runs[1].trajectory.stamps_s[0]))
+    metres = []
+    for run, own in zip(runs, views, strict=True):
+        cloud = run.cloud("anchors.ply")
+        points = np.zeros((0, 3)) if cloud is None else cloud.p_w.astype(np.float64)
+        metres.append(metre_by_depth([view for _, view in own], points))
+    return figures | {
+        "known_after_s": known_s,
+        "placed_late_s": max(0.0, after_s - known_s) if math.isfinite(known_s) else 0.0,
+        "metres_off_depth": _ratio(metres),
+    }
+
+
+def _ratio(pair: list[float | None]) -> float | None:
+    """Absolute log of the ratio of two positive numbers."""
+    first, second = pair
+    return abs(math.log(second / first)) if first and second else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,22 +121,16 @@ def views_of(run: RunFolder, place: Path) -> list[tuple[float, View]]:
     maps, camera = depth.maps, depth.maps.taken_by(depth.camera)
     stamps = run.trajectory.stamps_s
     inside = np.flatnonzero((maps.stamps_s >= stamps[0] - 0.05) & (maps.stamps_s <= stamps[-1] + 0.05))
-    rows = [row for k, row in enumerate(inside) if k == 0 or _ticks(maps.stamps_s[inside[[k - 1, k]]], stamps[0])]
-    T_w_c, known = interpolate(truth, maps.stamps_s[rows])
+    period = np.floor((maps.stamps_s[inside] - stamps[0]) / VIEWS_S + 1e-6)
+    rows = inside[np.diff(period, prepend=-np.inf) > 0]
     views = []
-    for row, T, is_known in zip(rows, T_w_c, known, strict=True):
+    for row, T, known in zip(rows.tolist(), *interpolate(truth, maps.stamps_s[rows]), strict=True):
         stamp = float(maps.stamps_s[row])
-        run_pose = run.trajectory.T_w_c[int(np.abs(stamps - stamp).argmin())]
-        if is_known:
-            view = View(camera, T @ maps.T_c_d, maps.read(int(row), depth.camera), se3.inverse(maps.T_c_d), run_pose)
+        pose = run.trajectory.T_w_c[int(np.abs(stamps - stamp).argmin())]
+        if known:
+            view = View(camera, T @ maps.T_c_d, maps.read(row, depth.camera), se3.inverse(maps.T_c_d), pose)
             views.append((stamp, view))
     return views
-
-
-def _ticks(stamps_s: FloatArray, begin_s: float) -> bool:
-    """Whether another period has begun between two stamps."""
-    before, after = np.floor((stamps_s - begin_s) / VIEWS_S + 1e-6)
-    return bool(after > before)
 
 
 def known_after_s(first: list[View], second: list[tuple[float, View]], begin_s: float) -> float:
@@ -162,32 +144,10 @@ def known_after_s(first: list[View], second: list[tuple[float, View]], begin_s: 
 
 def metre_by_depth(views: list[View], p_w: FloatArray) -> float | None:
     """True metres per unit of a run's map points ``(P, 3)``, by the depth maps in which they are seen."""
-    logs = []
+    logs = [np.zeros(0)]
     for view in views:
         p_c = se3.transform(view.T_d_c @ se3.inverse(view.T_run_w_c), p_w)
-        depth = view.depths_at(p_c)
-        ratio = np.log(depth / np.where(p_c[:, 2] > 0, p_c[:, 2], np.nan))
+        ratio = np.log(view.depths_at(p_c) / np.where(p_c[:, 2] > 0, p_c[:, 2], np.nan))
         logs.append(ratio[np.abs(ratio) <= SAME_UNIT])  # the others are hidden, or a map's error
-    together = np.concatenate(logs) if logs else np.zeros(0)
+    together = np.concatenate(logs)
     return math.exp(float(np.median(together))) if len(together) else None
-
-
-def _by_depth_maps(second: RunFolder, truth: Truth, first: RunFolder, first_truth: Truth, after_s: float) -> Figures:
-    """Figures that need depth maps of both flights; empty without."""
-    if truth.poses is None or first_truth.poses is None:
-        return {}
-    there, here = views_of(first, first_truth.poses), views_of(second, truth.poses)
-    if not there or not here:
-        return {}
-    known_s = known_after_s([view for _, view in there], here, float(second.trajectory.stamps_s[0]))
-    metres = []
-    for flown, views in ((first, there), (second, here)):
-        cloud = flown.cloud("anchors.ply")
-        points = np.zeros((0, 3)) if cloud is None else cloud.p_w.astype(np.float64)
-        metres.append(metre_by_depth([view for _, view in views], points))
-    both = [m for m in metres if m is not None]
-    return {
-        "known_after_s": known_s,
-        "placed_late_s": max(0.0, after_s - known_s) if math.isfinite(known_s) else 0.0,
-        "metres_off_depth": abs(math.log(both[1] / both[0])) if len(both) == 2 else None,
-    }

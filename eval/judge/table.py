@@ -1,12 +1,13 @@
-"""The judge's record as an aligned table that is Markdown too, one line a cell, and every run below it."""
+"""The judge's record as a table that is Markdown too, one line a cell and every run below it; two records compared."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from edgeslam_torch.eval.experiment.figures import Difference, Figure, chance, difference
 from edgeslam_torch.eval.judge.thresholds import Row, Threshold, verdicts_of_cell, verdicts_of_groups
+from edgeslam_torch.eval.report.tables import aligned
 
 _FOOTNOTES = (
     "end, live: share of the frames whose pose rests on the map, at the end and when they came. path: ATE in % of the "
@@ -22,89 +23,101 @@ _FOOTNOTES = (
     "same in passes of ORB over one 640 x 480 image, timed before and after the run. Variants also decode the frames "
     "that they leave out.",
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    """One column of the table."""
-
-    title: str
-    figure: str
-    text: str = "{:.4f}"
-    factor: float = 1.0
-    spread: bool = False
-    """With several seeds, give the lowest and highest too."""
-
-    def cell(self, values: Sequence[float | None]) -> str:
-        """Median of the runs' values; a dash when there is none."""
-        known = self.factor * np.array([v for v in values if v is not None])
-        if len(known) == 0:
-            return "-"
-        text = self.text.format(float(np.median(known)))
-        if self.spread and len(known) > 1:
-            text += f" [{self.text.format(known.min())} {self.text.format(known.max())}]"
-        return text
-
+_MAX_NAMED = 8
+"""Maximum number of cells of only one record that are named."""
 
 COLUMNS = (
-    Column("frames", "frames", "{:.0f}"),
-    Column("end %", "supported_end", "{:.1f}", 100.0),
-    Column("live %", "supported_live", "{:.1f}", 100.0),
-    Column("lost", "losses", "{:.0f}"),
-    Column("pieces", "pieces", "{:.0f}"),
-    Column("ATE", "ate_m", spread=True),
-    Column("online", "online_m", spread=True),
-    Column("path %", "ate_percent", "{:.2f}"),
-    Column("return %", "return_percent", "{:.2f}"),
-    Column("rot °", "rotation_deg", "{:.2f}"),
-    Column("scale", "scale", "{:.3f}"),
-    Column("sigma %", "scale_sigma", "{:.1f}", 100.0),
-    Column("z", "scale_z", "{:+.1f}"),
-    Column("1st scale s", "first_scale_s", "{:.1f}"),
-    Column("its z", "first_scale_sigmas", "{:.1f}"),
-    Column(">3 sigma %", "beyond_3_sigma", "{:.0f}", 100.0),
-    Column("SE(3)", "se3_m"),
-    Column("still", "still_m", "{:.3f}"),
-    Column("1st s", "first_m"),
-    Column("x rest", "first_over_rest", "{:.1f}"),
-    Column("points", "map_points", "{:.0f}"),
-    Column("median cm", "map_median_m", "{:.2f}", 100.0),
-    Column("5 cm %", "map_within_5cm", "{:.0f}", 100.0),
-    Column("10 cm %", "map_within_10cm", "{:.0f}", 100.0),
-    Column("CPU ms", "cpu_ms", "{:.1f}"),
-    Column("CPU ORB", "cpu_orb", "{:.1f}"),
-    Column("wall s", "wall_s", "{:.1f}"),
-    Column("MB", "memory_mb", "{:.0f}"),
+    Figure("frames", "frames", "{:.0f}"),
+    Figure("supported_end", "end %", "{:.1f}", 100.0, floor=0.005, relative=False, lower_is_better=False),
+    Figure(
+        "supported_live", "live %", "{:.1f}", 100.0, floor=0.005, one_seed=0.01, relative=False, lower_is_better=False
+    ),
+    Figure("losses", "lost", "{:.0f}", floor=0.5, relative=False),
+    Figure("pieces", "pieces", "{:.0f}"),
+    Figure("ate_m", "ATE", spread=True, floor=0.03, one_seed=0.05),
+    Figure("online_m", "online", spread=True, floor=0.03, one_seed=0.16),
+    Figure("ate_percent", "path %", "{:.2f}"),
+    Figure("return_percent", "return %", "{:.2f}"),
+    Figure("rotation_deg", "rot °", "{:.2f}", floor=0.03, one_seed=0.28),
+    Figure("scale", "scale", "{:.3f}"),
+    Figure("scale_sigma", "sigma %", "{:.1f}", 100.0),
+    Figure("scale_z", "z", "{:+.1f}"),
+    Figure("first_scale_s", "1st scale s", "{:.1f}"),
+    Figure("first_scale_sigmas", "its z", "{:.1f}"),
+    Figure("beyond_3_sigma", ">3 sigma %", "{:.0f}", 100.0),
+    Figure("se3_m", "SE(3)"),
+    Figure("still_m", "still", "{:.3f}"),
+    Figure("first_m", "1st s"),
+    Figure("first_over_rest", "x rest", "{:.1f}"),
+    Figure("map_points", "points", "{:.0f}", floor=0.05, lower_is_better=False),
+    Figure("map_median_m", "median cm", "{:.2f}", 100.0, floor=0.03, one_seed=0.80),
+    Figure(
+        "map_within_5cm", "5 cm %", "{:.0f}", 100.0, floor=0.02, one_seed=0.08, relative=False, lower_is_better=False
+    ),
+    Figure("map_within_10cm", "10 cm %", "{:.0f}", 100.0),
+    Figure("cpu_ms", "CPU ms", "{:.1f}", floor=0.10),
+    Figure("cpu_orb", "CPU ORB", "{:.1f}"),
+    Figure("wall_s", "wall s", "{:.1f}"),
+    Figure("memory_mb", "MB", "{:.0f}"),
 )
+"""Floors for one seed are two standard deviations of a difference of two runs, measured with three seeds on two
+recordings (tum_fr1_xyz, 7scenes_redkitchen); recordings with tracking losses scatter more."""
+COMPARED = tuple(figure for figure in COLUMNS if figure.floor is not None)
 
 
 def markdown(record: dict[str, Any], thresholds: Sequence[Threshold]) -> str:
     """Medians and thresholds, what passed, footnotes, and every run when there are several a cell."""
     rows = record["rows"]
-    names = list(dict.fromkeys(row["cell"] for row in rows))
-    parts = [_conditions(record), "", aligned(_header(), [_line(name, rows, thresholds) for name in names])]
-    parts += ["", *_outcome(names, rows, thresholds)]
+    names = _names(record)
+    header = ["cell", *(c.title for c in COLUMNS), "thresholds"]
+    lines = [[name, *_cells(_rows(record, name)), _passed(name, rows, thresholds)] for name in names]
+    parts = [_conditions(record), "", aligned(header, lines), "", *_outcome(lines, rows, thresholds)]
     notes = [f"- {_run_name(row)}: {note}" for row in rows for note in row["notes"]]
     parts += ["", *notes] if notes else []
     parts += ["", *_FOOTNOTES]
     if len(rows) > len(names):
-        parts += ["", "Every run:", "", aligned(_header()[:-1], [_run_line(row) for row in rows])]
+        parts += ["", "Every run:", "", aligned(header[:-1], [[_run_name(row), *_cells([row])] for row in rows])]
     return "\n".join(parts) + "\n"
 
 
-def aligned(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A Markdown table whose columns are padded to one width, numbers to the right."""
-    widths = [max(3, *(len(line[k]) for line in (header, *lines))) for k in range(len(header))]
+def markdown_against(before: dict[str, Any], after: dict[str, Any]) -> str:
+    """Both records' medians and their ratio, cell by cell, ``!`` where it got worse and ``+`` where better."""
+    names = [n for n in _names(after) if n in _names(before)]
+    worse: list[str] = []
+    lines = [[name, *(_side_by_side(name, c, before, after, worse) for c in COMPARED)] for name in names]
+    parts = [f"{before['commit']} -> {after['commit']}, medians, ratio; ! worse, + better by more than the noise"]
+    parts += ["", aligned(["cell", *(c.title for c in COMPARED)], lines), ""]
+    missing = sorted(set(_names(before)) ^ set(_names(after)))
+    named = ", ".join(missing) if len(missing) <= _MAX_NAMED else f"{len(missing)} cells"
+    parts += [f"only in one of the two: {named}"] if missing else []
+    parts += [f"worse: {', '.join(worse) if worse else 'nothing'}"]
+    if any(len(_rows(record, name)) == 1 for record in (before, after) for name in names):
+        parts += [
+            "cells with one seed: noise as measured on two recordings; CPU time also depends on the machine's load"
+        ]
+    return "\n".join(parts) + "\n"
 
-    def text(line: Sequence[str]) -> str:
-        cells = [c.ljust(w) if k in (0, len(header) - 1) else c.rjust(w)
-                 for k, (c, w) in enumerate(zip(line, widths, strict=True))]  # fmt: skip
-        return "| " + " | ".join(cells) + " |"
 
-    rule = (
-        "|" + "|".join("-" * (w + 1) + ("-" if k in (0, len(header) - 1) else ":") for k, w in enumerate(widths)) + "|"
-    )
-    return "\n".join([text(header), rule, *(text(line) for line in lines)])
+def compared(figure: Figure, before: Sequence[float], after: Sequence[float]) -> Difference:
+    """Two cells' values of a figure."""
+    return difference(figure, before, after, chance((before, after)))
+
+
+def _side_by_side(name: str, figure: Figure, before: dict[str, Any], after: dict[str, Any], worse: list[str]) -> str:
+    a, b = (_values(_rows(record, name), figure) for record in (before, after))
+    if not a and not b:
+        return "-"
+    text = f"{figure.cell(a)} -> {figure.cell(b)}"
+    if not b:
+        worse.append(f"{name} {figure.title} (none any more)")
+        return f"{text} !"
+    if not a:
+        return text
+    found = compared(figure, a, b)
+    ratio = f" x{found.after / found.before:.2f}" if figure.relative and found.before > 0 else ""
+    if found.verdict == "worse":
+        worse.append(f"{name} {figure.title}{ratio}")
+    return f"{text}{ratio}{ {'worse': ' !', 'better': ' +', 'same': ''}[found.verdict] }"
 
 
 def _conditions(record: dict[str, Any]) -> str:
@@ -114,46 +127,47 @@ def _conditions(record: dict[str, Any]) -> str:
     return f"EdgeSLAM-Torch {record['commit']}, {record['made']}, {seeds} seed(s){changed}{frames}"
 
 
-def _header() -> list[str]:
-    return ["cell", *(c.title for c in COLUMNS), "thresholds"]
-
-
-def _line(name: str, rows: Sequence[Row], thresholds: Sequence[Threshold]) -> list[str]:
+def _passed(name: str, rows: Sequence[Row], thresholds: Sequence[Threshold]) -> str:
     own = [row for row in rows if row["cell"] == name]
-    cells = [c.cell([row["figures"].get(c.figure) for row in own]) for c in COLUMNS]
-    return [name, *cells, _thresholds_cell(name, own, rows, thresholds)]
-
-
-def _thresholds_cell(name: str, own: Sequence[Row], rows: Sequence[Row], thresholds: Sequence[Threshold]) -> str:
     errors = [row["error"] for row in own if row["error"]]
     if errors:
         return f"FAIL {len(errors)} of {len(own)} runs"
     verdicts = verdicts_of_cell(name, rows, thresholds)
+    passed = sum(v.ok for v in verdicts)
     if not verdicts:
         return "-"
-    passed = sum(v.ok for v in verdicts)
     return "pass" if passed == len(verdicts) else f"FAIL {len(verdicts) - passed} of {len(verdicts)}"
 
 
-def _outcome(names: Sequence[str], rows: Sequence[Row], thresholds: Sequence[Threshold]) -> list[str]:
+def _outcome(lines: Sequence[Sequence[str]], rows: Sequence[Row], thresholds: Sequence[Threshold]) -> list[str]:
     """How many cells pass, what fails, and the thresholds that only a share of runs must pass."""
-    judged = [_thresholds_cell(name, [r for r in rows if r["cell"] == name], rows, thresholds) for name in names]
-    with_thresholds = [text for text in judged if text != "-"]
-    lines = [f"{sum(text == 'pass' for text in with_thresholds)} of {len(with_thresholds)} cells with thresholds pass."]
-    lines += [f"- {_run_name(row)}: no result: {row['error']}" for row in rows if row["error"]]
-    for name in names:
+    outcomes = [line[-1] for line in lines if line[-1] != "-"]
+    out = [f"{outcomes.count('pass')} of {len(outcomes)} cells with thresholds pass."]
+    out += [f"- {_run_name(row)}: no result: {row['error']}" for row in rows if row["error"]]
+    for name, *_ in lines:
         failed = [str(v) for v in verdicts_of_cell(name, rows, thresholds) if not v.ok]
-        lines += [f"- {name}: {'; '.join(failed)}"] if failed else []
+        out += [f"- {name}: {'; '.join(failed)}"] if failed else []
     for v in verdicts_of_groups(rows, thresholds):
-        word = "pass" if v.ok else "FAIL"
-        cells = ", ".join(v.threshold.cells)
-        lines.append(f"- {cells}: {v.threshold} in {v.threshold.share:.0%}: {v.passed} of {v.runs}, {word}")
-    return lines
+        word, cells = "pass" if v.ok else "FAIL", ", ".join(v.threshold.cells)
+        out.append(f"- {cells}: {v.threshold} in {v.threshold.share:.0%}: {v.passed} of {v.runs}, {word}")
+    return out
 
 
-def _run_line(row: Row) -> list[str]:
-    return [_run_name(row), *(c.cell([row["figures"].get(c.figure)]) for c in COLUMNS)]
+def _cells(rows: Sequence[Row]) -> list[str]:
+    return [figure.cell(_values(rows, figure)) for figure in COLUMNS]
 
 
 def _run_name(row: Row) -> str:
     return f"{row['cell']} seed {row['seed']}"
+
+
+def _names(record: dict[str, Any]) -> list[str]:
+    return list(dict.fromkeys(row["cell"] for row in record["rows"]))
+
+
+def _rows(record: dict[str, Any], name: str) -> list[Row]:
+    return [row for row in record["rows"] if row["cell"] == name]
+
+
+def _values(rows: Sequence[Row], figure: Figure) -> list[float]:
+    return [float(v) for row in rows if (v := row["figures"].get(figure.name)) is not None and np.isfinite(v)]

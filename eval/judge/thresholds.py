@@ -1,6 +1,5 @@
 """Limits of the figures of cells, as data, and their evaluation."""
 
-import operator
 import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -35,20 +34,17 @@ class Threshold:
         """Whether a cell's name matches."""
         return any(fnmatchcase(cell, pattern) for pattern in self.cells)
 
-    def passes(self, row: Row, base: float | None = None) -> bool:
-        """Whether a run is within the limit; a figure that it does not have is not.
+    def passes(self, value: float | None, base: float | None = None) -> bool:
+        """Whether a run's figure is within the limit; one that it does not have is not.
 
         Args:
-            row: The run.
-            base: Median of the figure over the runs of the cell that it is a variant of; None when there is none.
+            value: The figure.
+            base: Its median over the runs of the cell that the run's is a variant of; None when there is none.
         """
-        value = row["figures"].get(self.figure)
-        if value is None:
+        if value is None or (self.kind == "at_most_times_base" and base is None):
             return False
-        if self.kind == "at_most_times_base":
-            return base is not None and bool(value <= self.limit * base)
-        compare = operator.ge if self.kind == "at_least" else operator.le
-        return bool(compare(value, self.limit))
+        limit = self.limit * base if base is not None and self.kind == "at_most_times_base" else self.limit
+        return value >= limit if self.kind == "at_least" else value <= limit
 
     def __str__(self) -> str:
         sign = ">=" if self.kind == "at_least" else "<="
@@ -86,13 +82,12 @@ def read_thresholds(path: Path = THRESHOLDS) -> list[Threshold]:
         tables = tomllib.loads(path.read_text(encoding="utf-8")).get("threshold", [])
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise EvaluationError(f"{path}: cannot be read as thresholds ({error})") from error
-    thresholds = []
-    for table in tables:
-        cells = tuple(table.get("cells", ()))
-        for figure, limit in table.items():
-            if figure != "cells":
-                thresholds.append(_threshold(cells, figure, limit, path))
-    return thresholds
+    return [
+        _threshold(tuple(table.get("cells", ())), figure, limit, path)
+        for table in tables
+        for figure, limit in table.items()
+        if figure != "cells"
+    ]
 
 
 def _threshold(cells: tuple[str, ...], figure: str, limit: Any, path: Path) -> Threshold:
@@ -105,33 +100,24 @@ def _threshold(cells: tuple[str, ...], figure: str, limit: Any, path: Path) -> T
 def verdicts_of_cell(cell: str, rows: Sequence[Row], thresholds: Iterable[Threshold]) -> list[Verdict]:
     """Verdicts of one cell on thresholds that every run must pass."""
     own = [row for row in rows if row["cell"] == cell]
-    found = [
-        _verdict(threshold, own, rows) for threshold in thresholds if threshold.share == 1.0 and threshold.covers(cell)
-    ]
+    found = [_verdict(t, own, rows) for t in thresholds if t.share == 1.0 and t.covers(cell)]
     return [verdict for verdict in found if verdict.runs]
 
 
 def verdicts_of_groups(rows: Sequence[Row], thresholds: Iterable[Threshold]) -> list[Verdict]:
     """Verdicts of all runs on thresholds that only a share of them must pass."""
-    groups = [
-        (threshold, [r for r in rows if threshold.covers(r["cell"])])
-        for threshold in thresholds
-        if threshold.share < 1.0
-    ]
-    return [_verdict(threshold, covered, rows) for threshold, covered in groups if covered]
+    found = [_verdict(t, [row for row in rows if t.covers(row["cell"])], rows) for t in thresholds if t.share < 1.0]
+    return [verdict for verdict in found if verdict.runs]
 
 
 def _verdict(threshold: Threshold, covered: Sequence[Row], rows: Sequence[Row]) -> Verdict:
-    based = [(row, _base(row, threshold.figure, rows)) for row in covered]
+    pairs = [(row["figures"].get(threshold.figure), _base(row, threshold.figure, rows)) for row in covered]
     if threshold.kind == "at_most_times_base":  # without its base a variant cannot be judged
-        based = [(row, base) for row, base in based if base is not None]
-        covered = [row for row, _ in based]
-    passed = sum(threshold.passes(row, base) for row, base in based)
-    values = [row["figures"].get(threshold.figure) for row in covered]
-    known = [v for v in values if v is not None]
+        pairs = [(value, base) for value, base in pairs if base is not None]
+    known = [value for value, _ in pairs if value is not None]
     worst = min(known, default=None) if threshold.kind == "at_least" else max(known, default=None)
-    worst = worst if len(known) == len(values) else None
-    return Verdict(threshold, passed, len(covered), worst)
+    passed = sum(threshold.passes(*pair) for pair in pairs)
+    return Verdict(threshold, passed, len(pairs), worst if len(known) == len(pairs) else None)
 
 
 def _base(row: Row, figure: str, rows: Sequence[Row]) -> float | None:

@@ -96,6 +96,19 @@ def markdown_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
 
 
+def aligned(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """The same with columns padded to one width, numbers to the right, the first and the last column to the left."""
+    ends = (0, len(titles) - 1)
+    widths = [max(3, *(len(line[k]) for line in (titles, *rows))) for k in range(len(titles))]
+
+    def text(line: Sequence[str]) -> str:
+        cells = (c.ljust(w) if k in ends else c.rjust(w) for k, (c, w) in enumerate(zip(line, widths, strict=True)))
+        return "| " + " | ".join(cells) + " |"
+
+    rule = "|" + "|".join("-" * (w + 1) + ("-" if k in ends else ":") for k, w in enumerate(widths)) + "|"
+    return "\n".join([text(titles), rule, *map(text, rows)])
+
+
 def report(scores: Sequence[RunScore], markdown: bool = False) -> str:
     """Trajectory table, map table and findings."""
     table = markdown_table if markdown else text_table

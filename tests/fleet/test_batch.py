@@ -9,7 +9,8 @@ import pytest
 
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import ConfigError, OutputError
-from edgeslam_torch.fleet.batch import Local, run_batch
+from edgeslam_torch.eval.experiment.runner import Local
+from edgeslam_torch.fleet.batch import run_batch
 from edgeslam_torch.fleet.folder import BatchSettings
 from edgeslam_torch.fleet.manifest import read_manifests
 from edgeslam_torch.jobs.watched import Limits
@@ -17,7 +18,7 @@ from edgeslam_torch.jobs.watched import Limits
 GOOD = """
 import json, pathlib, sys
 job = pathlib.Path(sys.argv[1])
-task = json.loads((job / 'task.json').read_text())
+task = json.loads((job / 'case.json').read_text())
 (pathlib.Path(task['batch']) / 'flights' / task['name']).mkdir()
 figures = {'frames': 10, 'tracked': 0.9, 'ate_m': 0.02, 'scale_error': float('nan'), 'scale_source': 'depth'}
 (job / 'result.json').write_text(json.dumps({'key': task['key'], 'figures': figures, 'notes': ['a <b>note</b>']}))
@@ -51,7 +52,7 @@ def recordings(tmp_path, write_images):
 
 def batch(tmp_path, recordings, starter, settings=None, manifest=None, said=None):
     flights = read_manifests([str(manifest or recordings)])
-    runner = Local(2, Limits(60.0), start=starter)
+    runner = Local(2, Limits(60.0), 1, starter)
     say = (lambda _: None) if said is None else said.append
     return run_batch(flights, settings or BatchSettings(SlamConfig()), tmp_path / "out", runner, say)
 

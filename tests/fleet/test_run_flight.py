@@ -9,6 +9,7 @@ import pytest
 from fake_slam import FakeSlam
 
 from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.eval.experiment import runner
 from edgeslam_torch.fleet import run_flight
 from edgeslam_torch.fleet.folder import BatchFolder, BatchSettings
 from edgeslam_torch.fleet.manifest import read_manifests
@@ -28,7 +29,7 @@ def flown(tmp_path, write_tum, monkeypatch):
         manifest.write_text(f"recording,name,camera,topic,truth\n{recording},one,,{topic},{truth}\n")
         folder = BatchFolder(tmp_path / "out")
         task = folder.task(read_manifests([str(manifest)])[0], BatchSettings(SlamConfig()))
-        return folder, task, run_flight.main(folder.prepare(task))
+        return folder, task, runner.main(task.prepare())
 
     return fly
 
@@ -57,7 +58,7 @@ def test_finished_flight_is_a_run_folder_with_report_picture_and_result(tmp_path
     assert {"summary.json", "trajectory.txt", "report.html", "edge_map.ply"} <= {p.name for p in made.iterdir()}
     assert (folder.path / "pictures" / "one.jpg").is_file()
     assert list((folder.path / "work").iterdir()) == []
-    found = folder.result(task)
+    found = task.result()
     assert (found["figures"]["frames"], found["figures"]["tracked"]) == (FRAMES, 1.0)
     assert "ate_m" not in found["figures"]
     source = json.loads((made / "summary.json").read_text())["source"]["path"]
@@ -68,7 +69,7 @@ def test_recordings_own_truth_is_used(tmp_path, flown, write_tum):
     recording = write_tum(tmp_path / "rec", FRAMES)
     write_truth(recording / "groundtruth.txt")
     folder, task, _ = flown(recording)
-    figures = folder.result(task)["figures"]
+    figures = task.result()["figures"]
     assert 0 < figures["ate_m"] < 0.05
     assert figures["scale_error"] == pytest.approx(1.0, abs=0.3), "the truth is twice as long"
 
@@ -78,14 +79,14 @@ def test_given_truth_comes_first(tmp_path, flown, write_tum):
     write_truth(recording / "groundtruth.txt", scale=9.0)
     write_truth(tmp_path / "truth.txt", scale=2.0)
     folder, task, _ = flown(recording, truth="truth.txt")
-    assert folder.result(task)["figures"]["scale_error"] == pytest.approx(1.0, abs=0.3)
+    assert task.result()["figures"]["scale_error"] == pytest.approx(1.0, abs=0.3)
 
 
 def test_truth_that_cannot_be_used_is_a_note_and_the_run_stays(tmp_path, flown, write_tum):
     (tmp_path / "truth.txt").write_text("1 2 3\n")
     folder, task, code = flown(write_tum(tmp_path / "rec", FRAMES), truth="truth.txt")
     assert code == 0
-    assert any(note.startswith("not evaluated: ") for note in folder.result(task)["notes"])
+    assert any(note.startswith("not evaluated: ") for note in task.result()["notes"])
 
 
 def test_broken_recording_says_why_in_its_last_line(tmp_path, flown, capsys):
@@ -93,7 +94,7 @@ def test_broken_recording_says_why_in_its_last_line(tmp_path, flown, capsys):
     folder, task, code = flown(tmp_path / "rec")
     assert code == 1
     assert capsys.readouterr().err.strip().endswith("or a video")
-    assert folder.result(task) is None
+    assert task.result() is None
     assert list((folder.path / "flights").iterdir()) == []
 
 
@@ -113,7 +114,7 @@ def test_a_bags_topic_is_the_tables(tmp_path, flown, topic, frames):
     bag = two_cameras(tmp_path / "rec.mcap", {"/cam0": 12, "/cam1": 9})
     folder, task, code = flown(bag, topic=topic)
     assert code == 0
-    assert folder.result(task)["figures"]["frames"] == frames
+    assert task.result()["figures"]["frames"] == frames
 
 
 def test_a_topic_that_is_not_there_is_one_line(tmp_path, flown, capsys):

@@ -5,11 +5,11 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from pickled import pickled
 from point_map import check_map
 from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.config import DepthConfig, SlamConfig, WindowConfig
-from edgeslam_torch.eval.benchmark.ablation import pickled
 from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.geometry.robust_statistics import Kernel
 from edgeslam_torch.map.slam_map import SlamMap

@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from pickled import pickled
 from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.config import DepthConfig, SlamConfig, WindowConfig
-from edgeslam_torch.eval.benchmark.ablation import pickled
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.refinement import choose_window, refine, window_problem

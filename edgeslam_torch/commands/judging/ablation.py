@@ -1,12 +1,11 @@
 """Ablation: the benchmark with one change at a time, as one table."""
 
 import argparse
-import os
-import sys
 import time
 from pathlib import Path
 
-from edgeslam_torch.errors import OutputError, SourceError
+from edgeslam_torch.commands.judging._common import recordings, say, writing
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.output_file import output_file
 
@@ -28,31 +27,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run all variants and print the table."""
-    from edgeslam_torch.eval.benchmark.ablation import AblationSettings, markdown_ablation, run_ablation
+    """Run all variants and print the table; 1 when a run failed."""
+    from edgeslam_torch.eval.benchmark.benchmark import BenchSettings
+    from edgeslam_torch.eval.benchmark.rows import markdown_ablation, run_ablation
 
-    data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)
+    data = recordings(args.data)
     if data is None:
         raise SourceError("no recordings: give --data or set EDGESLAM_DATA")
-    settings = AblationSettings(
-        data=data,
-        seeds=tuple(range(max(1, args.seeds))),
-        sequences=tuple(args.sequence),
-        rows=tuple(args.row),
-        max_frames=args.max_frames,
-        overrides=tuple(args.set),
-    )
+    seeds = tuple(range(max(1, args.seeds)))
+    settings = BenchSettings(data, seeds, tuple(args.sequence), args.max_frames, overrides=tuple(args.set))
     out = args.out or Path("runs") / time.strftime("ablation-%Y%m%d-%H%M%S")
-    try:
-        text = markdown_ablation(run_ablation(settings, out, _say))
+    with writing():
+        record = run_ablation(settings, args.row, out, say)
+        text = markdown_ablation(record)
         if args.markdown is not None:
             write_text(args.markdown, text)
-    except OSError as error:
-        raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
     print(text)
     print(f"results: {out / 'ablation.json'}")
-    return 0
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(text + "\n")
+    return 1 if any(run["error"] for row in record["rows"].values() for run in row["runs"]) else 0

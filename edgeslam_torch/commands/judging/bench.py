@@ -2,18 +2,14 @@
 
 import argparse
 import json
-import os
-import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-from edgeslam_torch.errors import OutputError
+from edgeslam_torch.commands.judging._common import recordings, say, writing
+from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.output_file import output_file
-
-if TYPE_CHECKING:
-    from edgeslam_torch.eval.benchmark.benchmark import BenchSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,9 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="of those flights (default: 0)")
     parser.add_argument(
         "--perception",
-        choices=("truth", "slam"),
+        choices=("truth", "slam", "udp"),
         default="truth",
-        help="source of the planner's states: true pose and depth (default), or the SLAM",
+        help="source of the planner's states: true pose and depth (default), the SLAM, or the SLAM over UDP in real "
+        "time",
     )
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="of those flights at a time (default: 1)")
     parser.add_argument("--no-micro", action="store_true", help="omit the times of solver and depth network")
@@ -74,16 +71,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run or compare; 1 when a run failed."""
+    from edgeslam_torch.eval.benchmark import benchmark, compare, rows
+
     if args.navigation:
         return _navigation(args)
-    from edgeslam_torch.eval.benchmark import benchmark
-    from edgeslam_torch.eval.benchmark import compare as bench_compare
-
     if args.compare is not None:
-        before, after = (bench_compare.read_record(path) for path in args.compare)
-        print(bench_compare.markdown_compare(before, after))
+        before, after = (compare.read_record(path) for path in args.compare)
+        print(compare.markdown_compare(before, after))
         return 0
-    data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)
+    data = recordings(args.data)
     if args.get:
         data, fetched = _fetched(args)
         args.sequence += fetched
@@ -97,22 +93,24 @@ def main(args: argparse.Namespace) -> int:
         micro=not args.no_micro,
     )
     if data is None:
-        _say("no recordings (--data or EDGESLAM_DATA): the synthetic flight alone")
+        say("no recordings (--data or EDGESLAM_DATA): the synthetic flight alone")
     out = args.out or Path("runs") / time.strftime("bench-%Y%m%d-%H%M%S")
-    if args.depth:
-        return _networks(settings, args, out)
-    try:
-        record = benchmark.run_benchmark(settings, out, _say)
-        text = benchmark.markdown_bench(record)
+    with writing():
+        if args.depth:
+            result: dict[str, Any] = rows.compare_networks(settings, args.depth, out, say)
+            runs = [run for record in result.values() for run in record["runs"]]
+            text = rows.markdown_networks(result)
+        else:
+            result = benchmark.run_benchmark(settings, out, say)
+            runs, text = result["runs"], benchmark.markdown_bench(result)
         if args.json is not None:
-            write_text(args.json, json.dumps(record, indent=1, default=str) + "\n")
+            write_text(args.json, json.dumps(result, indent=1, default=str) + "\n")
         if args.markdown is not None:
             write_text(args.markdown, text)
-    except OSError as error:
-        raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
     print(text)
-    print(f"results: {out / 'bench.json'}")
-    return 1 if any(run["error"] for run in record["runs"]) else 0
+    if not args.depth:
+        print(f"results: {out / 'bench.json'}")
+    return 1 if any(run["error"] for run in runs) else 0
 
 
 def _fetched(args: argparse.Namespace) -> tuple[Path, list[str]]:
@@ -124,35 +122,12 @@ def _fetched(args: argparse.Namespace) -> tuple[Path, list[str]]:
     return root, [open_dataset(root / recording.name).name for recording in fetch(args.get, root, args.agree, print)]
 
 
-def _networks(settings: "BenchSettings", args: argparse.Namespace, out: Path) -> int:
-    """Compare depth networks; 1 when a run failed."""
-    from edgeslam_torch.eval.benchmark.networks import compare_networks, markdown_networks
-
-    try:
-        records = compare_networks(settings, args.depth, out, _say)
-        text = markdown_networks(records)
-        if args.json is not None:
-            write_text(args.json, json.dumps(records, indent=1, default=str) + "\n")
-        if args.markdown is not None:
-            write_text(args.markdown, text)
-    except OSError as error:
-        raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
-    print(text)
-    return 1 if any(run["error"] for record in records.values() for run in record["runs"]) else 0
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(text + "\n")
-
-
 def _navigation(args: argparse.Namespace) -> int:
     """Flights through named worlds; 1 when one touched something, or failed."""
-    from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, is_corridor
-    from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
-    from edgeslam_torch.eval.judge.navigation.flown import Case
-    from edgeslam_torch.eval.judge.navigation.runner import FAILED, judge_flights
-    from edgeslam_torch.eval.judge.navigation.table import markdown
+    from edgeslam_torch.eval.judge.navigation.flight import Case
+    from edgeslam_torch.eval.judge.navigation.perception import FAULTS
+    from edgeslam_torch.eval.judge.navigation.table import FAILED, judge_flights, markdown
     from edgeslam_torch.synthetic.sites.build import JUDGED, SITES
 
     worlds, behaviours = args.world or list(JUDGED), args.behaviour or ["goto"]
@@ -175,7 +150,8 @@ def _navigation(args: argparse.Namespace) -> int:
     ]
     if not cases:
         raise ConfigError(f"--behaviour corridor: none of {', '.join(worlds)} is a corridor")
-    flights = judge_flights(cases, out, args.jobs, _say)
+    with writing():
+        flights = judge_flights(cases, out, args.jobs, say)
     print(markdown(flights))
     print(f"results: {out / 'navigation.md'}")
     return 1 if any(flown.contacts or flown.ended.startswith(FAILED) for flown in flights) else 0

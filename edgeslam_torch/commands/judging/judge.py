@@ -2,11 +2,10 @@
 
 import argparse
 import json
-import os
-import sys
 from pathlib import Path
 
-from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.commands.judging._common import recordings, say, writing
+from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.atomic import write_text
 
 CELLS = ("base", "variants", "flights", "telemetry", "all")
@@ -52,13 +51,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Run the missing cells, print and write the table; 1 when a cell has no result."""
     from edgeslam_torch.eval.judge.cells import list_cells
-    from edgeslam_torch.eval.judge.compare import RECORD, markdown_against, read_record
     from edgeslam_torch.eval.judge.release import command_outputs, last_cost, release_cells, release_record
-    from edgeslam_torch.eval.judge.runner import JudgeSettings, judge
-    from edgeslam_torch.eval.judge.table import markdown
+    from edgeslam_torch.eval.judge.runner import RECORD, JudgeSettings, judge, read_record
+    from edgeslam_torch.eval.judge.table import markdown, markdown_against
     from edgeslam_torch.eval.judge.thresholds import THRESHOLDS, read_thresholds
 
-    data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)
+    data = recordings(args.data)
     thresholds = read_thresholds(args.thresholds or THRESHOLDS)
     before = read_record(args.against) if args.against is not None else None
     old = [name for name in args.set if name in CELLS]
@@ -70,12 +68,12 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError("--release runs its own cells with default settings: omit --only, --set and --max-frames")
     if args.release is not None:
         cells = release_cells(data)
-        _say(f"release: {len(cells)} runs{last_cost(args.release)}; call it again to go on where it was interrupted")
+        say(f"release: {len(cells)} runs{last_cost(args.release)}; call it again to go on where it was interrupted")
     else:
         cells = list_cells(data, args.cells, range(args.first_seed, args.first_seed + args.seeds), args.only)
     settings = JudgeSettings(tuple(args.set), args.max_frames, args.jobs, args.timeout, args.flights)
-    try:
-        record = judge(cells, settings, args.out, _say)
+    with writing():
+        record = judge(cells, settings, args.out, say)
         text = markdown(record, thresholds)
         if before is not None:
             text += "\n" + markdown_against(before, record)
@@ -83,15 +81,9 @@ def main(args: argparse.Namespace) -> int:
         write_text(args.out / "judge.md", text)
         if args.release is not None:
             assert data is not None
-            outputs = command_outputs(data, args.out, record["commit"], _say)
+            outputs = command_outputs(data, args.out, record["commit"], say)
             release = release_record(record["rows"], record["commit"], outputs)
             write_text(args.release, json.dumps(release, indent=1) + "\n")
-    except OSError as error:
-        raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
     print(text)
     print(f"results: {args.out / RECORD}")
     return 1 if any(row["error"] for row in record["rows"]) else 0
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(text + "\n")

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edgeslam_torch.eval.judge.navigation.flown import Flown
 from edgeslam_torch.flying.tasks import WayHome
 from edgeslam_torch.navigation.corridor.follow import FollowCorridor
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
@@ -13,12 +13,15 @@ from edgeslam_torch.navigation.tasks import Explore, GoTo, Task
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
 
+if TYPE_CHECKING:
+    from edgeslam_torch.eval.judge.navigation.flight import Flown
+
 REACHED_M = 0.35
 """Distance to the true goal that counts as reached when the planner reports it."""
 HOME_M = 0.3
 """Distance to the true take-off that counts as home."""
-EXPLORED_S = 180.0
-"""Time to explore a room and its neighbours."""
+EXPLORED_S, FOLLOWED_S = 180.0, 100.0
+"""Time to explore a room and its neighbours, and to follow a corridor."""
 _END_M = 1.6
 """Distance to a corridor's true end that counts as reached; the drone stops 0.6 m before a wall."""
 _SAME_EXIT_M, _SAME_EXIT_COS = 0.5, np.cos(np.radians(35.0))
@@ -41,7 +44,7 @@ class Behaviour:
     """Tasks and their success criterion."""
 
     steps: tuple[Callable[[Moment], Task], ...]
-    reached: Callable[[Flown, Site], bool]
+    reached: Callable[["Flown", Site], bool]
     """Whether a flight that completed its last task without contact reached its goal."""
     limit_s: float = 120.0
 
@@ -54,23 +57,11 @@ def _home(moment: Moment) -> Task:
     return WayHome(moment.track_w)
 
 
-def _explore(moment: Moment) -> Task:
-    return Explore(moment.clock_s + EXPLORED_S)
-
-
-def _corridor(moment: Moment) -> Task:
-    return FollowCorridor(moment.clock_s + 100.0)
-
-
-def _at_goal(flown: Flown, site: Site) -> bool:
-    return flown.distance_m < REACHED_M
-
-
-def _at_home(flown: Flown, site: Site) -> bool:
+def _at_home(flown: "Flown", site: Site) -> bool:
     return flown.home_m < HOME_M
 
 
-def _at_an_end(flown: Flown, site: Site) -> bool:
+def _at_an_end(flown: "Flown", site: Site) -> bool:
     here = np.array(flown.track_w[-1][:2])
     return bool(min(np.linalg.norm(here - end) for end in corridor_ends(site)) < _END_M)
 
@@ -95,10 +86,10 @@ def corridor_ends(site: Site) -> list[FloatArray]:
 
 
 BEHAVIOURS = {
-    "goto": Behaviour((_goal,), _at_goal),
+    "goto": Behaviour((_goal,), lambda flown, site: flown.distance_m < REACHED_M),
     "home": Behaviour((_goal, _home), _at_home, 240.0),
-    "corridor": Behaviour((_corridor,), _at_an_end, 160.0),
-    "exits": Behaviour((_explore, _home), _at_home, 420.0),
+    "corridor": Behaviour((lambda moment: FollowCorridor(moment.clock_s + FOLLOWED_S),), _at_an_end, 160.0),
+    "exits": Behaviour((lambda moment: Explore(moment.clock_s + EXPLORED_S), _home), _at_home, 420.0),
 }
 """By name; ``exits`` explores for `EXPLORED_S` and returns home, and the exits found are scored, too."""
 
@@ -111,11 +102,9 @@ def right_exits(found: Sequence[Exit], site: Site) -> int:
         >>> right_exits([], named_site("corridor", 0))
         0
     """
-    right = 0
-    for true in site.exits:
-        for exit_ in found:
-            near = float(np.linalg.norm(exit_.centre_w[:2] - true.centre_w[:2])) < _SAME_EXIT_M
-            if near and abs(float(exit_.normal_w @ true.normal_w)) > _SAME_EXIT_COS:
-                right += 1
-                break
-    return right
+
+    def same(exit_: Exit, true: Exit) -> bool:
+        near = float(np.linalg.norm(exit_.centre_w[:2] - true.centre_w[:2])) < _SAME_EXIT_M
+        return near and abs(float(exit_.normal_w @ true.normal_w)) > _SAME_EXIT_COS
+
+    return sum(any(same(exit_, true) for exit_ in found) for true in site.exits)

@@ -1,30 +1,38 @@
-"""One judged flight."""
+"""One judged flight: its case and result; flown in lockstep, or over UDP in real time."""
 
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from edgeslam_torch.drone.emulator.air import Air
 from edgeslam_torch.drone.emulator.drone import Contact, DroneModel, Mode
-from edgeslam_torch.drone.emulator.lockstep import Event, LockstepTello
+from edgeslam_torch.drone.emulator.lockstep import LockstepTello
 from edgeslam_torch.drone.emulator.room import drone_at
+from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, Behaviour, Moment, right_exits
-from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
-from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
-from edgeslam_torch.eval.judge.navigation.near import WatchedPerception
-from edgeslam_torch.eval.judge.navigation.oracle import shortest_m
-from edgeslam_torch.eval.judge.navigation.perception import DEPTH_SIZE, TruePerception, nothing_painted
-from edgeslam_torch.eval.judge.navigation.slam_perception import IMAGE_SIZE, SlamPerception
+from edgeslam_torch.eval.judge.navigation.perception import (
+    DEPTH_SIZE,
+    FAULTS,
+    IMAGE_SIZE,
+    Conditions,
+    Perception,
+    SlamPerception,
+    TruePerception,
+    WatchedPerception,
+    nothing_painted,
+)
+from edgeslam_torch.eval.judge.navigation.pictures import shortest_m
 from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.pilot import Phase
-from edgeslam_torch.synthetic.sites.build import named_site
+from edgeslam_torch.synthetic.sites.build import SITES, named_site
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
 
@@ -35,47 +43,137 @@ _SIGMAS, _NO_HARM_M = 3.0, 0.1
 """Bound of a consistent pose error: standard deviations, plus the hull's radius."""
 _FREE_M = 0.6
 """Clearance above which the cruising speed is measured."""
+PERCEPTIONS = ("truth", "slam", "udp")
+"""Source of the planner's states: true pose and depth, or the SLAM; the SLAM over UDP in real time."""
 
 
-class Perception(Protocol):
-    """Source of the planner's states."""
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One case."""
 
-    def state(self, now_s: float, events: list[Event]) -> DroneState:
-        """Current state from the events since the last call."""
+    world: str
+    seed: int
+    fault: str = "none"
+    perception: str = "truth"
+    """One of `PERCEPTIONS`."""
+    behaviour: str = "goto"
+    """One of `behaviours.BEHAVIOURS`."""
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        name = f"{self.world}_{self.seed}_{self.fault}_{self.perception}"
+        return name if self.behaviour == "goto" else f"{name}_{self.behaviour}"
+
+    def check(self) -> None:
+        """Refuse names that do not exist.
+
+        Raises:
+            EvaluationError: If one does not.
+        """
+        for what, names in (
+            ("world", SITES),
+            ("fault", FAULTS),
+            ("behaviour", BEHAVIOURS),
+            ("perception", PERCEPTIONS),
+        ):
+            if getattr(self, what) not in names:
+                raise EvaluationError(f"unknown {what} {getattr(self, what)!r}; there are {', '.join(names)}")
+
+
+@dataclass(slots=True)
+class Flown:
+    """Result of a case."""
+
+    case: Case
+    reached: bool = False
+    ended: str = ""
+    """The planner's final phase, or the reason of the landing."""
+    contacts: int = 0
+    """Contact events (`contact_events`)."""
+    crashed: bool = False
+    landed: bool = False
+    time_s: float = 0.0
+    """Duration from take-off to the goal or the end."""
+    oracle_s: float = 0.0
+    """Duration of the shortest path in the true map, at the same speed and with the same take-off."""
+    path_m: float = 0.0
+    distance_m: float = 0.0
+    """Final distance to the goal."""
+    home_m: float = 0.0
+    """Final distance to the take-off."""
+    exits: list[int] = field(default_factory=lambda: [0, 0, 0])
+    """Number of true exits, of reported ones, and of correct ones."""
+    cruise_m_s: float = 0.0
+    """Median speed in free space."""
+    clearance_p5_m: float = 0.0
+    """5th percentile of the clearance beyond the hull."""
+    clearance_min_m: float = 0.0
+    cpu_ms: float = 0.0
+    """CPU time of planning and mapping per tick."""
+    cpu_worst_ms: float = 0.0
+    near: list[int] = field(default_factory=lambda: [0, 0, 0])
+    """Sectors with an obstacle at 0.3 to 1 m; those 0.3 m too far; those even at two sigmas (`near_counts`)."""
+    depth_age_s: list[float] = field(default_factory=lambda: [math.nan, math.nan])
+    """Age of the newest depth when it is planned with: median and 95th percentile."""
+    off: list[int] = field(default_factory=lambda: [0, 0])
+    """Ticks with metric scale; those of them with an inconsistent pose (`is_beyond`)."""
+    off_m: float = 0.0
+    """Maximum horizontal pose error in ticks with metric scale."""
+    dangers: tuple[str, ...] = ()
+    """Dangers handled by the supervisor."""
+    track_w: list[list[float]] = field(default_factory=list)
+    """``(N, 3)`` true path, for pictures."""
+    attitude: list[list[float]] = field(default_factory=list)
+    """``(N, 5)`` along it: clock [s]; roll, pitch, yaw [rad]; clearance beyond the hull [m]."""
+
+    def record(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    @classmethod
+    def of_record(cls, record: dict[str, Any]) -> "Flown":
+        """From JSON."""
+        return cls(**{**record, "case": Case(**record["case"]), "dangers": tuple(record["dangers"])})
+
+
+def run_flight(case: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """What the process of a case does."""
+    flight = Case(**case["flight"])
+    if flight.perception == "udp":
+        from edgeslam_torch.eval.judge.navigation.over_udp import fly_over_udp
+
+        return {"flown": fly_over_udp(flight).record()}
+    return {"flown": fly(flight).record()}
 
 
 def fly(case: Case, limits: NavLimits | None = None) -> Flown:
     """Fly one case in lockstep.
 
     Raises:
-        ValueError: If the world, the fault or the behaviour is unknown.
+        EvaluationError: If the world, the fault or the behaviour is unknown.
     """
-    if case.fault not in FAULTS:
-        raise ValueError(f"unknown fault {case.fault!r}; there are {', '.join(FAULTS)}")
-    if case.behaviour not in BEHAVIOURS:
-        raise ValueError(f"unknown behaviour {case.behaviour!r}; there are {', '.join(BEHAVIOURS)}")
-    limits, conditions = limits or NavLimits(), FAULTS[case.fault]
-    site = named_site(case.world, case.seed)
+    case.check()
+    limits, conditions, behaviour = limits or NavLimits(), FAULTS[case.fault], BEHAVIOURS[case.behaviour]
+    site, by_slam = named_site(case.world, case.seed), case.perception == "slam"
     wind = np.array([0.0, conditions.wind_m_s, 0.0])
     air = Air(wind, 0.5 * conditions.wind_m_s, np.random.default_rng([case.seed, 1]))
-    size = IMAGE_SIZE if case.perception == "slam" else DEPTH_SIZE
-    drone, paint, camera = drone_at(site, TELLO_TILT_RAD, size, conditions.battery, air)
-    tello = LockstepTello(drone, paint if case.perception == "slam" else nothing_painted, conditions.radio, case.seed)
-    seeing: Perception = (
-        SlamPerception(camera, conditions, case.seed)
-        if case.perception == "slam"
-        else TruePerception(site, drone, conditions)
+    drone, paint, camera = drone_at(
+        site, TELLO_TILT_RAD, IMAGE_SIZE if by_slam else DEPTH_SIZE, conditions.battery, air
     )
+    tello = LockstepTello(drone, paint if by_slam else nothing_painted, conditions.radio, case.seed)
+    seeing: Perception = TruePerception(site, drone, conditions)
+    if by_slam:
+        seeing = SlamPerception(camera, conditions, case.seed)
     perception = WatchedPerception(seeing, site)
-    tasks = _Task(site, BEHAVIOURS[case.behaviour], FlightController(limits), conditions.scale)
+    tasks = _Tasks(site, behaviour, FlightController(limits), conditions.scale)
     found = Flown(case)
     if case.behaviour == "goto":
         found.oracle_s = _take_off_s(limits) + shortest_m(site, limits) / limits.speed_m_s
-    ticks = _fly(tello, perception, tasks, conditions.hung_s, found)
-    _sum_up(found, site, drone, ticks, BEHAVIOURS[case.behaviour])
+    _sum_up(found, site, drone, _fly(tello, perception, tasks, conditions, found), behaviour)
     known = tasks.flight_controller.exits()
     found.exits = [len(site.exits), len(known), right_exits(known, site)]
-    found.near = [perception.counts.sectors, perception.counts.too_far, perception.counts.surely_too_far]
+    found.near = perception.counts.tolist()
     if perception.depth_age_s:
         found.depth_age_s = np.round(np.percentile(perception.depth_age_s, [50, 95]), 3).tolist()
     return found
@@ -89,12 +187,11 @@ def is_beyond(state: DroneState, p_w: FloatArray) -> bool:
         >>> is_beyond(state, np.array([3.0, 0.0, 1.0])), is_beyond(state, np.array([2.8, 0.0, 1.0]))
         (False, True)
     """
-    way = state.scale_sigma * float(np.linalg.norm(state.p_w[:2]))
-    sigma = math.hypot(state.home_sigma_m, way)
+    sigma = math.hypot(state.home_sigma_m, state.scale_sigma * float(np.linalg.norm(state.p_w[:2])))
     return float(np.linalg.norm(state.p_w[:2] - p_w[:2])) > _SIGMAS * sigma + _NO_HARM_M
 
 
-class _Task:
+class _Tasks:
     """Gives the flight controller one task after the other, however the previous one ended."""
 
     def __init__(self, site: Site, behaviour: Behaviour, flight_controller: FlightController, scale: float) -> None:
@@ -125,13 +222,12 @@ class _Tick:
 
 
 def _fly(
-    tello: LockstepTello,
-    perception: Perception,
-    tasks: _Task,
-    hung_s: tuple[float, float] | None,
-    found: Flown,
+    tello: LockstepTello, perception: Perception, tasks: _Tasks, conditions: Conditions, found: Flown
 ) -> list[_Tick]:
-    drone, ticks, dangers, touches = tello.drone, [], [], []
+    drone, controller = tello.drone, tasks.flight_controller
+    ticks: list[_Tick] = []
+    dangers: dict[str, None] = {}
+    touches: list[float] = []
     tello.send("takeoff")
     landing = False
     while tello.clock_s < tasks.limit_s:
@@ -149,24 +245,18 @@ def _fly(
         if drone.mode is not Mode.FLYING or landing:
             continue
         began = time.process_time()
-        if hung_s is None or not hung_s[0] <= tello.clock_s < hung_s[1]:
+        if not conditions.hung_s[0] <= tello.clock_s < conditions.hung_s[1]:
             tasks.go_on(state.stamp_s)
-            tasks.flight_controller.plan(state)
-        order = tasks.flight_controller.order(state)
+            controller.plan(state)
+        order = controller.order(state)
         cpu_s = time.process_time() - began
         speed, clear_m = float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w)
         ticks.append(_Tick(tello.clock_s, drone.p_w.copy(), drone.rpy(), speed, clear_m, cpu_s))
-        if order.danger and str(order.danger) not in dangers:
-            dangers.append(str(order.danger))
-        if tasks.over():
-            found.ended, found.time_s = (
-                found.ended or str(tasks.flight_controller.ended()),
-                found.time_s or tello.clock_s,
-            )
-            landing = True
-            tello.send("land")
-        elif order.land:
-            found.ended, found.time_s, landing = str(order.danger), tello.clock_s, True
+        if order.danger:
+            dangers[str(order.danger)] = None
+        landing = tasks.over() or order.land
+        if landing:
+            found.ended, found.time_s = str(controller.ended() if tasks.over() else order.danger), tello.clock_s
             tello.send("land")
         else:
             right, forward, up, clockwise = (round(100 * v) for v in order.command.sticks())

@@ -1,27 +1,93 @@
-"""Table of flights with confidence intervals."""
+"""All judged flights: run in processes of their own, kept, and summed up in tables with confidence intervals."""
 
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
-from edgeslam_torch.eval.judge.navigation.flown import Flown
+from edgeslam_torch.eval.experiment.conditions import code_state
+from edgeslam_torch.eval.experiment.runner import Local, Task, run_tasks
+from edgeslam_torch.eval.judge.navigation.flight import Case, Flown
+from edgeslam_torch.eval.judge.navigation.pictures import film_strip, top_view
+from edgeslam_torch.eval.report.tables import markdown_table
+from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.plain import write_image
+from edgeslam_torch.jobs.watched import Limits
 
+FAILED = "failed"
+"""Prefix of the ending of a flight that raised an error."""
+_WORST = 6
+"""Number of worst flights with a top view and a film strip."""
+_TIMEOUT_S = 3600.0
 _Z = 1.959964
 HEAD = (
-    "| world | behaviour | fault | perception | flights | reached | contact | no contact and landed on the floor "
-    "| clearance p5, min [m] "
-    "| time over oracle | cruise [m/s] | CPU a tick, worst [ms] |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n"
-)
+    "world", "behaviour", "fault", "perception", "flights", "reached", "contact", "no contact and landed on the floor",
+    "clearance p5, min [m]", "time over oracle", "cruise [m/s]", "CPU a tick, worst [ms]",
+)  # fmt: skip
 NEAR_HEAD = (
-    "\n| perception | sectors of 3.7° with an obstacle at 0.3 to 1 m | more than 0.3 m too far | less two sigmas "
-    "| age of the newest depth, 95 % [s] |\n|---|---|---|---|---|\n"
-)
+    "perception", "sectors of 3.7° with an obstacle at 0.3 to 1 m", "more than 0.3 m too far", "less two sigmas",
+    "age of the newest depth, 95 % [s]",
+)  # fmt: skip
 OFF_HEAD = (
-    "\n| perception | ticks with metric scale | pose error more than 0.1 m beyond three sigmas | flights with any "
-    "| maximum error, median and worst [m] |\n|---|---|---|---|---|\n"
-)
-EXITS_HEAD = "\n| behaviour | perception | exits there | found | precision | recall |\n|---|---|---|---|---|---|\n"
+    "perception", "ticks with metric scale", "pose error more than 0.1 m beyond three sigmas", "flights with any",
+    "maximum error, median and worst [m]",
+)  # fmt: skip
+EXITS_HEAD = ("behaviour", "perception", "exits there", "found", "precision", "recall")
+
+
+def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[str], None]) -> list[Flown]:
+    """Fly all cases, write a record each, ``navigation.md``, top views and film strips of the worst.
+
+    Args:
+        cases: Cases to fly.
+        out: Output folder; results of the same cases and code in it are reused.
+        jobs: Number of parallel flights.
+        say: Called with a line for each finished flight.
+
+    Returns:
+        All flights. One that raised an error or whose process died counts as flown and not reached.
+    """
+    commit = code_state()
+    tasks = {
+        case: Task(
+            out / "flights",
+            case.name,
+            "edgeslam_torch.eval.judge.navigation.flight:run_flight",
+            {"commit": commit, "flight": Flown(case).record()["case"]},
+        )
+        for case in cases
+    }
+    flights: dict[Case, Flown] = {}
+    for case, found, ended in run_tasks(tasks, Local(jobs, Limits(_TIMEOUT_S))):
+        if found is None:
+            flights[case] = Flown(case, ended=f"{FAILED}: {ended.reason if ended else ''}")
+        else:
+            flights[case] = Flown.of_record(found["flown"])
+            write_text(out / f"flight_{case.name}.json", json.dumps(found["flown"]) + "\n")
+        if ended is not None:
+            say(_line(flights[case]))
+    done = [flights[case] for case in cases]
+    write_text(out / "navigation.md", markdown(done))
+    seen = [flown for flown in done if flown.track_w]
+    for flown in sorted(seen, key=lambda f: (f.reached, not f.contacts, f.clearance_min_m))[:_WORST]:
+        write_image(out / f"top_{flown.case.name}.png", top_view(flown))
+        strip = film_strip(flown)
+        if strip is not None:
+            write_image(out / f"film_{flown.case.name}.png", strip)
+    return done
+
+
+def _line(flown: Flown) -> str:
+    case, (there, found, right) = flown.case, flown.exits
+    dangers = f"; {', '.join(flown.dangers)}" if flown.dangers else ""
+    return (
+        f"{case.behaviour} {case.world} {case.seed} {case.fault} by {case.perception}: "
+        f"{flown.ended} after {flown.time_s:.1f} s (oracle {flown.oracle_s:.1f}), "
+        f"{flown.distance_m:.2f} m from the goal, {flown.home_m:.2f} m from the take-off, {flown.contacts} contacts, "
+        f"exits: {right} of {there} found and {found - right} wrong, clearance {flown.clearance_min_m:.2f} m{dangers}"
+    )
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
@@ -39,72 +105,72 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
+def _share(successes: int, trials: int) -> str:
+    low, high = wilson(successes, trials)
+    return f"{successes} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
 def markdown(flights: Sequence[Flown]) -> str:
-    """One row for every world and fault, and one for all static worlds without a fault."""
-    groups: dict[tuple[str, ...], list[Flown]] = {}
-    for flown in flights:
-        case = flown.case
-        groups.setdefault((case.perception, case.behaviour, case.fault, case.world), []).append(flown)
-    rows = [_row(key[::-1], groups[key]) for key in sorted(groups)]
+    """One row for every world and fault, and one for all static worlds without a fault; tables of exits, of near depth
+    and of inconsistent poses where there are any."""
+    by_case = _grouped(flights, "perception", "behaviour", "fault", "world")
+    rows = [_row(key[::-1], group) for key, group in by_case.items()]
     plain = [f for f in flights if f.case.fault == "none"]
     faulty = [f for f in flights if f.case.fault != "none"]
-    for name, group in (("all", plain), ("all with a fault", faulty)):
+    for names, group in ((("all", "none"), plain), (("all with a fault", "any"), faulty)):
         if len({(f.case.world, f.case.fault) for f in group}) > 1:
-            perception, behaviour = (
-                ", ".join(sorted({getattr(f.case, k) for f in group})) for k in ("perception", "behaviour")
-            )
-            rows.append(_row((name, "none" if group is plain else "any", behaviour, perception), group))
-    return HEAD + "".join(rows) + _exits(flights) + _near(flights) + _off(flights)
+            kinds = (", ".join(sorted({getattr(f.case, k) for f in group})) for k in ("behaviour", "perception"))
+            rows.append(_row((*names, *kinds), group))
+    exits = [_exits_row(key, group) for key, group in _grouped(flights, "perception", "behaviour").items()]
+    by_perception = _grouped(flights, "perception").items()
+    near = [_near_row(name, group) for (name,), group in by_perception]
+    off = [_off_row(name, [f for f in group if f.off[0]]) for (name,), group in by_perception]
+    text = markdown_table(HEAD, rows) + "\n"
+    for head, lines in ((EXITS_HEAD, exits), (NEAR_HEAD, near), (OFF_HEAD, off)):
+        known = [line for line in lines if line]
+        text += f"\n{markdown_table(head, known)}\n" if known else ""
+    return text
 
 
-def _exits(flights: Sequence[Flown]) -> str:
-    """Table of exits; empty without any."""
-    rows = []
-    for perception, behaviour in sorted({(f.case.perception, f.case.behaviour) for f in flights}):
-        group = [f.exits for f in flights if (f.case.perception, f.case.behaviour) == (perception, behaviour)]
-        there, found, right = np.sum(group, axis=0).tolist()
-        if there or found:
-            shares = f"{_share(right, found)} | {_share(right, there)}"
-            rows.append(f"| {behaviour} | {perception} | {there} | {found} | {shares} |\n")
-    return EXITS_HEAD + "".join(rows) if rows else ""
+def _grouped(flights: Sequence[Flown], *names: str) -> dict[tuple[str, ...], list[Flown]]:
+    groups: dict[tuple[str, ...], list[Flown]] = {}
+    for flown in flights:
+        groups.setdefault(tuple(getattr(flown.case, name) for name in names), []).append(flown)
+    return dict(sorted(groups.items()))
 
 
-def _near(flights: Sequence[Flown]) -> str:
-    """Table of near-depth errors; empty without near obstacles."""
-    rows = []
-    for perception in sorted({f.case.perception for f in flights}):
-        group = [f for f in flights if f.case.perception == perception]
-        sectors, too_far, surely = np.sum([f.near for f in group], axis=0).tolist()
-        if sectors:
-            ages = [f.depth_age_s for f in group if math.isfinite(f.depth_age_s[0])] or [[math.nan, math.nan]]
-            age = np.median(ages, axis=0)
-            shares = f"{100 * too_far / sectors:.1f} % | {100 * surely / sectors:.1f} %"
-            rows.append(f"| {perception} | {sectors} | {shares} | {age[0]:.2f}, {age[1]:.2f} |\n")
-    return NEAR_HEAD + "".join(rows) if rows else ""
+def _exits_row(names: tuple[str, ...], group: Sequence[Flown]) -> list[str]:
+    there, found, right = np.sum([f.exits for f in group], axis=0).tolist()
+    if not there and not found:
+        return []
+    return [names[1], names[0], f"{there}", f"{found}", _share(right, found), _share(right, there)]
 
 
-def _off(flights: Sequence[Flown]) -> str:
-    """Table of inconsistent poses; empty without metric scale."""
-    rows = []
-    for perception in sorted({f.case.perception for f in flights}):
-        group = [f for f in flights if f.case.perception == perception and f.off[0]]
-        if group:
-            moments, beyond = np.sum([f.off for f in group], axis=0).tolist()
-            worst = [f.off_m for f in group]
-            rows.append(
-                f"| {perception} | {moments} | {100 * beyond / moments:.1f} % | {sum(f.off[1] > 0 for f in group)} of "
-                f"{len(group)} | {np.median(worst):.2f}, {max(worst):.2f} |\n"
-            )
-    return OFF_HEAD + "".join(rows) if rows else ""
+def _near_row(perception: str, group: Sequence[Flown]) -> list[str]:
+    sectors, *far = np.sum([f.near for f in group], axis=0).tolist()
+    if not sectors:
+        return []
+    ages = [f.depth_age_s for f in group if math.isfinite(f.depth_age_s[0])] or [[math.nan, math.nan]]
+    age = np.median(ages, axis=0)
+    return [perception, f"{sectors}", *(f"{100 * n / sectors:.1f} %" for n in far), f"{age[0]:.2f}, {age[1]:.2f}"]
 
 
-def _row(names: tuple[str, ...], group: Sequence[Flown]) -> str:
+def _off_row(perception: str, group: Sequence[Flown]) -> list[str]:
+    if not group:
+        return []
+    moments, beyond = np.sum([f.off for f in group], axis=0).tolist()
+    worst, with_any = [f.off_m for f in group], sum(f.off[1] > 0 for f in group)
+    shares = [f"{100 * beyond / moments:.1f} %", f"{with_any} of {len(group)}"]
+    return [perception, f"{moments}", *shares, f"{np.median(worst):.2f}, {max(worst):.2f}"]
+
+
+def _row(names: tuple[str, ...], group: Sequence[Flown]) -> list[str]:
     """``names``: world, fault, behaviour, perception."""
     world, fault, behaviour, perception = names
     n = len(group)
     ratio = [f.time_s / f.oracle_s for f in group if f.reached and f.oracle_s]
     cruise = [f.cruise_m_s for f in group if math.isfinite(f.cruise_m_s)]
-    cells = (
+    return [
         world,
         behaviour,
         fault,
@@ -117,10 +183,4 @@ def _row(names: tuple[str, ...], group: Sequence[Flown]) -> str:
         f"{np.median(ratio):.2f}" if ratio else "",
         f"{np.median(cruise):.2f}" if cruise else "",
         f"{np.median([f.cpu_ms for f in group]):.1f}, {max(f.cpu_worst_ms for f in group):.0f}",
-    )
-    return "| " + " | ".join(cells) + " |\n"
-
-
-def _share(successes: int, trials: int) -> str:
-    low, high = wilson(successes, trials)
-    return f"{successes} ({100 * low:.0f} to {100 * high:.0f} %)"
+    ]

@@ -1,87 +1,88 @@
-"""The ablation's bookkeeping: which rows share a flight, what is repeated, and what the table says."""
+"""The ablation's bookkeeping: which runs are made, and what the table says."""
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from edgeslam_torch.eval.benchmark import ablation
-from edgeslam_torch.eval.benchmark.ablation import ROWS, AblationSettings, markdown_ablation, run_ablation
+from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.eval.benchmark import benchmark
+from edgeslam_torch.eval.benchmark.benchmark import BenchSettings
+from edgeslam_torch.eval.benchmark.rows import (
+    ROWS,
+    compare_networks,
+    markdown_ablation,
+    markdown_networks,
+    run_ablation,
+)
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.mapping import prior_anchors
+from edgeslam_torch.files.config_file import load_config
 
 
 @pytest.fixture
-def flights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list:
-    """Flights without flying: every row's figures follow from its settings."""
-    made: list = []
+def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[dict]:
+    """Cases without runs: every figure follows from the settings."""
+    made: list[dict] = []
 
-    def fly(folder, config, max_frames):
-        made.append((folder.name, config))
-        return SimpleNamespace(config=config)
+    def run_tasks(tasks, runner, resume):
+        for case, task in tasks.items():
+            made.append(dict(task.case))
+            words = " ".join(task.case["arguments"])
+            ate = 0.010 + 0.005 * ("alignment=false" in words) + 0.02 * ("weights=none" in words) + 0.0001 * case[1]
+            figures = {"ate_sim3_m": ate, "map_median_m": 0.02, "finish_ms": 500.0, "coverage": 1.0, "fps": 9.0}
+            yield case, {"key": "k", "figures": figures | {"map_points": 5.0}, "stages": {"depth": 3.0}}, None
 
-    def finish(flight, window, dataset):
-        ate = 0.010 + 0.005 * (not window.alignment) + 0.0001 * flight.config.seed
-        ate += 0.002 * (window.reprojection == "literal") + 0.02 * (flight.config.depth.weights == "none")
-        return {"ate_sim3_m": ate, "map_median_m": 0.02, "scale_error_abs": None, "finish_ms": 500.0}
-
-    monkeypatch.setattr(ablation, "find_sequences", lambda data, min_hz: {"kitchen": tmp_path / "kitchen"})
-    monkeypatch.setattr(ablation, "open_dataset", lambda folder: None)
-    monkeypatch.setattr(ablation, "_fly", fly)
-    monkeypatch.setattr(ablation, "_finish", finish)
+    monkeypatch.setattr(benchmark, "find_recordings", lambda data, min_hz: {"kitchen": (tmp_path / "kitchen", None)})
+    monkeypatch.setattr(benchmark, "run_tasks", run_tasks)
     return made
 
 
-def test_rows_that_differ_in_the_last_refinement_alone_share_a_flight(flights, tmp_path):
-    record = run_ablation(AblationSettings(tmp_path, seeds=(0, 1)), tmp_path / "out", lambda line: None)
-    assert len(flights) == 2 * 16  # all rows but those of the last refinement, which share the default's
-    assert len({config for _, config in flights}) == 2 * 15  # the network's own sigma is no setting
-    assert all(len(row["runs"]) == 2 for row in record["rows"].values())
-    assert record == json.loads((tmp_path / "out" / "ablation.json").read_text())
+def ablation(tmp_path, *names, **settings):
+    return run_ablation(BenchSettings(tmp_path, **settings), names, tmp_path, lambda line: None)
 
 
-def test_runs_that_are_there_are_not_repeated_and_other_settings_are_refused(flights, tmp_path):
-    settings = AblationSettings(tmp_path, seeds=(0,), rows=("points",))
-    run_ablation(settings, tmp_path / "out", lambda line: None)
-    run_ablation(settings, tmp_path / "out", lambda line: None)
-    assert len(flights) == 1
-    run_ablation(AblationSettings(tmp_path, seeds=(0,), rows=("no-cycle",)), tmp_path / "out", lambda line: None)
-    assert len(flights) == 2
-    with pytest.raises(EvaluationError, match="other settings; give another --out"):
-        run_ablation(AblationSettings(tmp_path, seeds=(0, 1)), tmp_path / "out", lambda line: None)
+def test_every_row_is_run_with_its_settings_beside_those_it_is_compared_with(runs, tmp_path):
+    record = ablation(tmp_path, "corners-no-angle", seeds=(0, 1), overrides=("seed=3",))
+    assert len(runs) == 6
+    assert {name for name, row in record["rows"].items() if row["runs"]} == {"default", "corners", "corners-no-angle"}
+    words = [run["arguments"][-1] for run in runs[::3]]
+    assert words == ["seed=3"] * 2 and "window.collinearity=relative" in runs[2]["arguments"]
+    assert record == json.loads((tmp_path / "ablation.json").read_text())
+    assert "fps" not in record["rows"]["default"]["runs"][0]["figures"]
 
 
-def test_table_names_what_got_worse_and_leaves_the_rest_alone(flights, tmp_path):
-    settings = AblationSettings(tmp_path, seeds=(0, 1), max_frames=300)
-    text = markdown_ablation(run_ablation(settings, tmp_path / "out", lambda line: None))
+def test_table_names_what_got_worse_and_leaves_the_rest_alone(runs, tmp_path):
+    text = markdown_ablation(ablation(tmp_path, seeds=(0, 1), max_frames=300))
     assert "first 300 frames, seeds 0 1" in text
     lines = {line.split("|")[1].strip(): line for line in text.splitlines() if line.startswith("| ")}
-    assert "| 10.1 | - | 20.0 | - | - | - | - | - | 500 |  |" in lines["default"]
-    assert "default: ATE worse" in lines["no edge alignment"]
-    assert "default: ATE worse" in lines["no depth network"]
+    assert "| 10.1 | - | 20.0 | - | 5 | 100 % | - | - | 500 |  |" in lines["default"]
+    assert "default: ATE Sim(3) worse" in lines["no edge alignment"]
+    assert "default: ATE Sim(3) worse" in lines["no depth network"]
     assert "default: same" in lines["no cycle loss"]
     assert "corners: same" in lines["literal angle (eqs. 24-25)"]
 
 
-def test_rows_can_be_told_apart_and_are_compared_with_rows():
-    names = [row.name for row in ROWS]
-    assert len(set(names)) == len(names)
-    assert all(row.against in names for row in ROWS)
+def test_rows_have_settings_that_exist_and_are_compared_with_rows():
+    assert all(row.against in ROWS for row in ROWS.values())
+    for name, row in ROWS.items():
+        try:
+            load_config(SlamConfig(), None, row.set)
+        except ConfigError as error:
+            pytest.fail(f"{name}: {error}")
+        exec(row.first.partition(";")[0])  # the module is there
 
 
 @pytest.mark.parametrize(
-    ("change", "message"), [({"rows": ("nonsense",)}, "no row"), ({"sequences": ("x",)}, "no seq")]
+    ("names", "only", "message"), [(("nonsense",), (), "no row"), ((), ("x",), "no sequence 'x'; there are kitchen")]
 )
-def test_unknown_names_are_refused(flights, tmp_path, change, message):
+def test_unknown_names_are_refused(runs, tmp_path, names, only, message):
     with pytest.raises(EvaluationError, match=message):
-        run_ablation(AblationSettings(tmp_path, **change), tmp_path / "out", lambda line: None)
+        ablation(tmp_path, *names, only=only)
 
 
-def test_the_network_is_believed_for_one_flight_alone():
-    bound = prior_anchors.MIN_SIGMA_LOG
-    with ablation._network_believed(True):
-        assert prior_anchors.MIN_SIGMA_LOG == 0.0
-    assert bound == prior_anchors.MIN_SIGMA_LOG > 0.0
-    with ablation._network_believed(False):
-        assert bound == prior_anchors.MIN_SIGMA_LOG
+def test_depth_networks_are_beside_each_other(runs, tmp_path):
+    records = compare_networks(BenchSettings(tmp_path, seeds=(0,)), ["default", "none"], tmp_path, lambda line: None)
+    lines = markdown_networks(records).splitlines()
+    assert lines[2].startswith("| default | kitchen, seed 0 | 0.0100 | 100.0% | 5 |") and lines[2].endswith("| 3.0 |")
+    assert lines[3].startswith("| none | kitchen, seed 0 | 0.0300 |")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.commands.judging import bench
-from edgeslam_torch.eval.benchmark.benchmark import figures_of, find_sequences, markdown_bench, read_peers
+from edgeslam_torch.eval.benchmark.benchmark import BenchSettings, figures_of, markdown_bench, read_peers, sequences
 from edgeslam_torch.eval.benchmark.compare import METRICS, compare, markdown_compare, read_record
 from edgeslam_torch.eval.benchmark.machine_speed import CpuTimes, disturbance, read_cpu_times
 from edgeslam_torch.eval.benchmark.probes import gather
@@ -201,9 +201,9 @@ def test_only_recordings_at_camera_rate_are_benchmarked(run_folder: Callable[...
         stamps = np.loadtxt(tmp_path / "truth.txt")[::step, 0]  # 20 and 6.7 Hz
         (folder / "rgb.txt").write_text("".join(f"{t:.6f} rgb/{t:.6f}.png\n" for t in stamps))
     (tmp_path / "data" / "no_truth").mkdir()
-    assert list(find_sequences(tmp_path / "data")) == ["fast"]
+    assert list(sequences(BenchSettings(tmp_path / "data"), others=())) == ["fast"]
     with pytest.raises(EvaluationError, match="no such folder"):
-        find_sequences(tmp_path / "nowhere")
+        sequences(BenchSettings(tmp_path / "nowhere"))
 
 
 @pytest.mark.parametrize("text", [None, "not json", "[]", '{"format": 0, "runs": []}'])

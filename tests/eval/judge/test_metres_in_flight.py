@@ -5,8 +5,7 @@ import pytest
 
 from edgeslam_torch.drone.emulator.lockstep import LockstepTello
 from edgeslam_torch.drone.emulator.room import drone_at
-from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
-from edgeslam_torch.eval.judge.navigation.slam_perception import IMAGE_SIZE, SlamPerception
+from edgeslam_torch.eval.judge.navigation.perception import FAULTS, IMAGE_SIZE, SlamPerception
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.synthetic.sites.build import named_site
 

@@ -1,6 +1,5 @@
 """A cell from recording to figures, on a tiny rendered flight."""
 
-import json
 import shutil
 import subprocess
 from dataclasses import replace
@@ -11,11 +10,12 @@ import numpy as np
 import pytest
 from rendered import CAMERA, film, sideways, stairs_world
 
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.dataset import open_dataset
+from edgeslam_torch.eval.inputs.dataset import find_recordings, open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory, write_tum
 from edgeslam_torch.eval.judge import flights, run_cell
-from edgeslam_torch.eval.judge.cells import VARIANTS, Cell, find_recordings, list_cells
+from edgeslam_torch.eval.judge.cells import VARIANTS, Cell, list_cells
 from edgeslam_torch.eval.judge.score import Truth, score
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.synthetic.flights.courses import COURSES, record_course
@@ -60,25 +60,20 @@ def recording(tmp_path_factory):
 
 
 def run(tmp_path, cell, **changes):
-    spec = {"key": "k", "cell": cell.to_dict(), "overrides": ["depth.weights=none"], "max_frames": None}
-    spec |= {"flights": str(tmp_path / "flights")} | changes
-    (tmp_path / "cell.json").write_text(json.dumps(spec))
-    code = run_cell.main(tmp_path)
-    result = tmp_path / "result.json"
-    return code, json.loads(result.read_text()) if result.is_file() else None
+    case = {"cell": cell.to_dict(), "overrides": ["depth.weights=none"], "max_frames": None}
+    return run_cell.run_cell(case | {"flights": str(tmp_path / "flights")} | changes, tmp_path)
 
 
 @pytest.fixture(scope="module")
 def judged(recording, tmp_path_factory):
-    """The recording's cell after its run: folder, exit code and result."""
+    """The recording's cell after its run: folder and result."""
     folder = tmp_path_factory.mktemp("judged")
-    return folder, *run(folder, Cell("stairs", 0, str(recording)))
+    return folder, run(folder, Cell("stairs", 0, str(recording)))
 
 
 def test_recording_is_run_and_judged(judged):
-    _, code, result = judged
-    figures = result["figures"]
-    assert code == 0 and result["key"] == "k" and result["notes"] == []
+    figures = judged[1]["figures"]
+    assert judged[1]["notes"] == []
     assert figures["frames"] == 36
     assert figures["supported_end"] == 1.0
     assert figures["supported_live"] < 1.0, "the first frames are posed against a guess"
@@ -91,8 +86,7 @@ def test_recording_is_run_and_judged(judged):
 
 
 def test_variant_is_judged_against_the_same_truth(recording, tmp_path):
-    code, result = run(tmp_path, Cell("stairs/half_rate", 0, str(recording), "half_rate"))
-    assert code == 0
+    result = run(tmp_path, Cell("stairs/half_rate", 0, str(recording), "half_rate"))
     assert result["figures"]["frames"] == 18
     assert result["figures"]["path_m"] == pytest.approx(length_m(bent_way()[::2]), rel=0.02)
 
@@ -109,10 +103,9 @@ def test_run_that_never_moves_scores_a_fixed_position(recording, judged, tmp_pat
     assert notes == ["the estimated trajectory never moves: nothing to align"]
 
 
-def test_cell_that_cannot_run_says_why_and_leaves_no_result(tmp_path, capsys):
-    code, result = run(tmp_path, Cell("gone", 0, str(tmp_path / "gone")))
-    assert code == 1 and result is None
-    assert "no such file or folder" in capsys.readouterr().err
+def test_cell_that_cannot_run_says_why(tmp_path):
+    with pytest.raises(SourceError, match="no such file or folder"):
+        run(tmp_path, Cell("gone", 0, str(tmp_path / "gone")))
 
 
 def test_simulated_flight_is_judged_by_its_world(tmp_path, monkeypatch):
@@ -125,12 +118,12 @@ def test_simulated_flight_is_judged_by_its_world(tmp_path, monkeypatch):
         return folders[0]
 
     monkeypatch.setattr(flights, "flight_folder", record)
-    code, result = run(tmp_path, Cell("flight/blank_corridor", 3, course="blank_corridor"))
-    assert code == 0 and result["figures"]["frames"] == 8
+    result = run(tmp_path, Cell("flight/blank_corridor", 3, course="blank_corridor"))
+    assert result["figures"]["frames"] == 8
     assert result["figures"]["path_m"] > 0
     assert folders == [tmp_path / "flights" / "blank_corridor"]
     assert Truth(None).surfaces is None
-    surfaces = run_cell._opened(Cell("flight/corridor", 3, course="corridor"), tmp_path, tmp_path)[1].surfaces
+    surfaces = run_cell.opened(Cell("flight/corridor", 3, course="corridor"), tmp_path, tmp_path)[1].surfaces
     floor = np.array([[0.0, 0.0, -0.25]])
     assert surfaces(floor) == pytest.approx([0.25], abs=0.01), "the floor is at height 0, a rug 8 mm above"
 
@@ -146,15 +139,15 @@ def test_nothing_to_see_is_a_source_like_any_other(kind):
 
 
 def test_nothing_to_see_claims_no_map(tmp_path):
-    code, result = run(tmp_path, Cell("none/black", 0, nothing="black"), max_frames=5)
+    result = run(tmp_path, Cell("none/black", 0, nothing="black"), max_frames=5)
     figures = result["figures"]
-    assert code == 0 and figures["supported_end"] == 0 and figures["map_points"] == 0 and figures["metric"] == 0
+    assert figures["supported_end"] == 0 and figures["map_points"] == 0 and figures["metric"] == 0
     assert "ate_m" not in figures
 
 
 def test_kidnapped_recording_gets_the_truth_of_the_frames_played(recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(run_cell, "KIDNAP", ((0, 10), (20, 30), (5, 10)))
-    source, truth = run_cell._opened(Cell("stairs/kidnap", 0, str(recording), "kidnap"), tmp_path, tmp_path)
+    monkeypatch.setitem(run_cell.CASES, "kidnap", {"stairs": [[0, 10], [20, 30], [5, 10]]})
+    source, truth = run_cell.opened(Cell("stairs/kidnap", 0, str(recording), "kidnap"), tmp_path, tmp_path)
     played, poses = list(source.frames()), read_trajectory(truth.poses)
     original = open_dataset(recording)
     picked = [*range(10), *range(20, 30), *range(5, 10)]
@@ -169,7 +162,7 @@ def test_recording_played_backwards_gets_the_truth_of_each_image_also_where_the_
     shutil.copytree(recording, place)
     truth_file = place / "groundtruth.txt"
     truth_file.write_text("".join(truth_file.read_text().splitlines(keepends=True)[:-4]))
-    source, truth = run_cell._opened(Cell("stairs/backwards", 0, str(place), "backwards"), tmp_path, tmp_path)
+    source, truth = run_cell.opened(Cell("stairs/backwards", 0, str(place), "backwards"), tmp_path, tmp_path)
     played, poses = list(source.frames()), read_trajectory(truth.poses)
     assert [f.path.name for f in played] == sorted((p.name for p in (place / "rgb").iterdir()), reverse=True)
     assert np.diff([f.stamp_s for f in played]) == pytest.approx(0.1)
@@ -184,9 +177,9 @@ def test_recording_played_backwards_gets_the_truth_of_each_image_also_where_the_
 @pytest.mark.slow
 def test_second_flight_is_in_the_map_of_the_first_and_judged_against_it(recording, tmp_path, monkeypatch):
     monkeypatch.setattr(run_cell, "HALF", 20)
-    code, result = run(tmp_path, Cell("stairs/second_flight", 0, str(recording), "second_flight"))
+    result = run(tmp_path, Cell("stairs/second_flight", 0, str(recording), "second_flight"))
     figures = result["figures"]
-    assert code == 0 and figures["frames"] == 16
+    assert figures["frames"] == 16
     assert figures["placed_after_s"] < 1.0 and figures["placed"] > 0.9
     assert 0.0 <= figures["metres_off"] < 0.1
 
@@ -231,8 +224,10 @@ def finished(code, stderr=""):
 
 
 def test_recordings_with_truth_are_found_and_short_variants_left_out(recording):
-    assert find_recordings(recording.parent) == {"stairs": (recording.resolve(), 36)}
-    assert find_recordings(recording) == {"stairs": (recording.resolve(), 36)}
+    for data in (recording.parent, recording):
+        ((name, (folder, stamps_s)),) = find_recordings(data).items()
+        assert (name, folder, len(stamps_s)) == ("stairs", recording.resolve(), 36)
+    assert find_recordings(recording.parent, min_hz=1e3) == {}
     names = {cell.name for cell in list_cells(recording.parent, "all", [0]) if cell.folder}
     assert {"stairs", "stairs/half_size", "stairs/focal_up"} <= names
     assert not names & {"stairs/half_rate", "stairs/from_100"}
@@ -265,7 +260,7 @@ def test_a_cut_shows_one_world_and_then_the_next(tmp_path, monkeypatch):
 
     monkeypatch.setattr(flights, "flight_folder", folder)
     monkeypatch.setattr(run_cell, "CUT_FRAMES", 4)
-    source, truth = run_cell._opened(
+    source, truth = run_cell.opened(
         Cell("flight/corridor/cut", 6, variant="cut", course="corridor"), tmp_path, tmp_path
     )
     frames = list(source.frames())

@@ -25,17 +25,17 @@ def seen(recording):
 
 
 def test_every_third_frame_keeps_its_stamp_and_is_numbered_anew(numbered):
-    third = sources.every(numbered, 3)
+    third = sources.part(numbered, step=3)
     assert seen(third) == [(k, round(0.3 * k, 3), 3 * k) for k in range(7)]
     assert third.length == 7
     assert seen(third) == seen(third), "frames can be asked for again"
 
 
 def test_start_at_leaves_the_first_frames_out(numbered):
-    later = sources.start_at(numbered, 17)
+    later = sources.part(numbered, 17)
     assert seen(later) == [(0, 1.7, 17), (1, 1.8, 18), (2, 1.9, 19)]
     assert later.length == 3
-    assert seen(sources.start_at(numbered, 50)) == []
+    assert seen(sources.part(numbered, 50)) == []
 
 
 def test_variant_starts_first_and_then_thins(numbered):
@@ -63,15 +63,6 @@ def test_wrong_focal_length_changes_nothing_but_the_calibration(numbered):
     assert seen(wrong) == seen(numbered)
 
 
-def test_cut_plays_its_stretches_at_one_pace(numbered):
-    plan = sources.Cut(((0, 3), (10, 12), (1, 3)), 0.1 * np.arange(20))
-    assert [image for _, _, image in seen(sources.cut(numbered, plan))] == [0, 1, 2, 10, 11, 1, 2]
-    assert plan.originals.tolist() == [0, 1, 2, 10, 11, 1, 2]
-    frames = list(sources.cut(numbered, plan).frames())
-    assert [f.index for f in frames] == list(range(7))
-    assert np.allclose([f.stamp_s for f in frames], 0.1 * np.arange(7))
-
-
 def test_half_size_of_jpeg_files_has_grey_and_colour_of_one_size(tmp_path, write_images):
     write_images(tmp_path / "rgb", ["1.000000.jpg", "1.100000.jpg"], (64, 48))
     (tmp_path / "rgb.txt").write_text("1.0 rgb/1.000000.jpg\n1.1 rgb/1.100000.jpg\n")
@@ -84,20 +75,28 @@ def test_half_size_of_jpeg_files_has_grey_and_colour_of_one_size(tmp_path, write
 
 def test_telemetry_from_long_before_the_start_is_left_out(numbered):
     numbered.telemetry = [TelemetrySample(0.1 * k) for k in range(20)]
-    later = sources.start_at(numbered, 17)
+    later = sources.part(numbered, 17)
     assert [round(s.stamp_s, 1) for s in later.telemetry] == [round(0.1 * k, 1) for k in range(7, 20)]
 
 
-def test_backwards_plays_from_the_end_in_the_same_span(tmp_path, write_images):
+@pytest.mark.parametrize(
+    ("order", "numbers", "stamps"),
+    [
+        (sources.backwards, [2, 1, 0], [1.0, 1.2, 1.3]),
+        (lambda t: sources.cut(t, [[0, 2], [2, 3], [0, 2]]), [0, 1, 2, 0, 1], [1.0, 1.15, 1.3, 1.45, 1.6]),
+    ],
+)
+def test_images_in_another_order_are_numbered_and_stamped_anew(tmp_path, write_images, order, numbers, stamps):
     names = ["1.000000.png", "1.100000.png", "1.300000.png"]
     write_images(tmp_path / "rgb", names, (64, 48))
     (tmp_path / "rgb.txt").write_text("".join(f"{n[:-4]} rgb/{n}\n" for n in names))
     save_camera(tmp_path / "camera.yaml", CAMERA)
-    turned = sources.backwards(open_source(tmp_path), read_sequence(tmp_path).images)
-    frames = list(turned.frames())
-    assert [f.path.name for f in frames] == names[::-1]
-    assert [f.index for f in frames] == [0, 1, 2]
-    assert [f.stamp_s for f in frames] == pytest.approx([1.0, 1.2, 1.3])
+    images = read_sequence(tmp_path).images
+    played = order(np.array([image.stamp_s for image in images]))
+    frames = list(sources.reordered(open_source(tmp_path), images, *played).frames())
+    assert [f.path.name for f in frames] == [names[k] for k in numbers]
+    assert [f.index for f in frames] == list(range(len(numbers)))
+    assert [f.stamp_s for f in frames] == pytest.approx(stamps)
 
 
 def test_a_perturbation_is_drawn_by_the_seed_and_far_below_a_pixel(numbered):

@@ -3,11 +3,15 @@
 import pytest
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.judge.compare import Compared, markdown_against, verdict
-from edgeslam_torch.eval.judge.table import COLUMNS, markdown
+from edgeslam_torch.eval.experiment.figures import Figure
+from edgeslam_torch.eval.judge.table import COLUMNS, compared, markdown, markdown_against
 from edgeslam_torch.eval.judge.thresholds import read_thresholds, verdicts_of_cell, verdicts_of_groups
 
-ATE = Compared("ate_m", "ATE", "{:.4f}", True, 0.03, 0.05)
+ATE = Figure("ate_m", "ATE", floor=0.03, one_seed=0.05)
+
+
+def verdict(figure, before, after):
+    return compared(figure, before, after).verdict
 
 
 def row(cell, seed=0, error="", **figures):
@@ -70,7 +74,7 @@ def test_bar_that_says_nothing_is_refused(tmp_path):
 
 
 def test_own_bars_name_figures_that_the_judge_has():
-    known = {column.figure for column in COLUMNS} | {"online_percent", "metric"}
+    known = {column.name for column in COLUMNS} | {"online_percent", "metric"}
     known |= {"placed_after_s", "placed", "placed_late_s", "metres_off", "metres_off_depth"}
     known |= {"scale_off", "scale_sigmas", "by_telemetry", "said"}
     assert {threshold.figure for threshold in read_thresholds()} <= known
@@ -107,7 +111,7 @@ def test_difference_within_the_scatter_of_the_seeds_is_no_difference():
     assert verdict(ATE, [0.013, 0.0131, 0.0132], [0.010, 0.0101, 0.0102]) == "better"
     assert verdict(ATE, [0.0100], [0.0104]) == "same", "one seed: 5 % are taken for noise"
     assert verdict(ATE, [0.0100, 0.0101], [0.0104, 0.0105]) == "worse", "two seeds that scatter little tell 4 %"
-    share = Compared("supported_end", "end", "{:.0%}", False, 0.005, 0.005, relative=False)
+    share = Figure("supported_end", "end", floor=0.005, relative=False, lower_is_better=False)
     assert verdict(share, [1.0], [0.9]) == "worse"
 
 

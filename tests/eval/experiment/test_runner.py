@@ -6,11 +6,15 @@ import sys
 
 import pytest
 
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.experiment import runner
+from edgeslam_torch.eval.experiment.runner import Local, Task
 from edgeslam_torch.eval.judge.cells import Cell
 from edgeslam_torch.eval.judge.runner import JudgeSettings, judge
+from edgeslam_torch.jobs.watched import Limits
 
 GOOD = (
-    "import json, sys, pathlib; f = pathlib.Path(sys.argv[1]); key = json.loads((f / 'cell.json').read_text())['key'];"
+    "import json, sys, pathlib; f = pathlib.Path(sys.argv[1]); key = json.loads((f / 'case.json').read_text())['key'];"
     "figures = {'frames': 5, 'supported_end': 1.0, 'ate_m': 0.01};"
     "(f / 'result.json').write_text(json.dumps({'key': key, 'figures': figures}))"
 )
@@ -27,15 +31,16 @@ class Starter:
         self.started = []
 
     def __call__(self, folder, log):
-        name = json.loads((folder / "cell.json").read_text())["cell"]["name"]
+        name = json.loads((folder / "case.json").read_text())["cell"]["name"]
         self.started.append(name)
         command = [sys.executable, "-S", "-c", self.scripts.get(name, GOOD), str(folder)]
         return subprocess.Popen(command, stdout=log, stderr=log, text=True)
 
 
-def run(tmp_path, names, starter, commit="abc", **settings):
+def run(tmp_path, names, starter, commit="abc", jobs=2, timeout_s=60.0, **settings):
     cells = [Cell(name, 0) for name in names]
-    return judge(cells, JudgeSettings(**settings), tmp_path, lambda _: None, commit, starter)
+    local = Local(jobs, Limits(timeout_s), start=starter)
+    return judge(cells, JudgeSettings(**settings), tmp_path, lambda _: None, commit, local)
 
 
 def test_crash_kill_and_time_out_are_rows_and_the_rest_goes_on(tmp_path):
@@ -102,3 +107,21 @@ def test_interrupted_judge_leaves_no_process(tmp_path):
         run(tmp_path, ["a", "b"], start)
     assert started[0].poll() is not None
     started[1].wait()
+
+
+def doubled(case, folder):
+    """What a case's process calls."""
+    if case["value"] < 0:
+        raise EvaluationError("a negative\nvalue")
+    (folder / "seen").touch()
+    return {"value": 2 * case["value"]}
+
+
+@pytest.mark.parametrize(("value", "code", "found"), [(3, 0, 6), (-1, 1, None)])
+def test_a_process_stores_what_the_named_function_returns_or_says_why_not(tmp_path, capsys, value, code, found):
+    task = Task(tmp_path, "case", f"{__name__}:doubled", {"value": value}, {"beside": 1})
+    assert runner.main(task.prepare()) == code
+    result = task.result()
+    assert (None if result is None else result["value"]) == found
+    assert capsys.readouterr().err == ("" if found else "a negative value\n")
+    assert Task(tmp_path, "case", f"{__name__}:doubled", {"value": value + 1}).result() is None

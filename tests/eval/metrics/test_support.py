@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from edgeslam_torch.eval.judge.support import at_end, live, points_in_view
+from edgeslam_torch.eval.metrics.support import at_end, live, points_in_view
 from edgeslam_torch.geometry.camera import Camera
 
 CAMERA = Camera(100, 80, 100.0, 100.0, 49.5, 39.5)

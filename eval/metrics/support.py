@@ -21,22 +21,14 @@ Status = Sequence[dict[str, str]]
 
 
 def live(rows: Status) -> NDArray[np.bool_]:
-    """Frames ``(F,)`` whose live pose was supported by the map."""
+    """Frames ``(F,)`` of ``status.csv`` whose live pose was supported by the map."""
     supported = {str(status) for status in FrameStatus if status.supported}
     return np.array([row.get("status") in supported for row in rows], dtype=bool)
 
 
 def at_end(rows: Status, T_w_c: FloatArray, p_w: FloatArray, camera: Camera) -> NDArray[np.bool_]:
-    """Frames ``(F,)`` whose final pose is supported by the delivered map.
-
-    Those stated by the run, with at least `MIN_POINTS` points of the map in view.
-
-    Args:
-        rows: Of ``status.csv``, one a frame.
-        T_w_c: ``(F, 4, 4)`` final poses.
-        p_w: ``(P, 3)`` delivered points, anchors and edges together.
-        camera: Of the run; its lens distortion is neglected.
-    """
+    """Frames ``(F,)`` stated as supported whose final pose ``(F, 4, 4)`` has `MIN_POINTS` of the delivered points
+    ``(P, 3)`` in view; lens distortion is neglected."""
     said = np.array([is_supported(row) for row in rows], dtype=bool)
     return said & (points_in_view(T_w_c, p_w, camera) >= MIN_POINTS)
 

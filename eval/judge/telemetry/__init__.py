@@ -1,1 +1,0 @@
-"""Telemetry simulated from ground truth, correct and faulty, and scoring of the live scale."""
