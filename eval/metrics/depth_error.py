@@ -16,6 +16,7 @@ from edgeslam_torch.types import FloatArray
 
 MIN_DEPTH_M = 1e-3
 """Lower bound of predictions: log and ratio need a positive depth."""
+_MAPS, _PICTURES = (".png", ".npy"), (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +52,7 @@ class DepthReport:
 
 
 def score_depth(
-    prediction: FloatArray,
-    truth: FloatArray,
-    mask: NDArray[np.bool_] | None = None,
-    median_scaled: bool = False,
+    prediction: FloatArray, truth: FloatArray, mask: NDArray[np.bool_] | None = None, median_scaled: bool = False
 ) -> DepthScore:
     """Errors of one depth map.
 
@@ -74,10 +72,19 @@ def score_depth(
     prediction, truth = np.squeeze(prediction), np.squeeze(truth)
     if prediction.shape != truth.shape:
         raise EvaluationError(f"the predicted depth map is {prediction.shape}, the measured one {truth.shape}")
-    valid = np.isfinite(truth) & (truth > 0) & np.isfinite(prediction)
-    if mask is not None:
-        valid &= mask
-    return _score(prediction[valid], truth[valid], median_scaled)
+    valid = np.isfinite(truth) & (truth > 0) & np.isfinite(prediction) & (True if mask is None else mask)
+    if not valid.any():
+        raise EvaluationError("no pixel has both a measured and a predicted depth")
+    d, truth = prediction[valid].astype(np.float64), truth[valid].astype(np.float64)
+    middle = float(np.median(d))
+    if median_scaled and middle <= 0:
+        raise EvaluationError("the predicted depth map is not positive")
+    scale = float(np.median(truth)) / middle if median_scaled else 1.0
+    d = np.maximum(d * scale, MIN_DEPTH_M)
+    ratio = np.maximum(d / truth, truth / d)
+    deltas = (float(np.mean(ratio < 1.25**k)) for k in (1, 2, 3))
+    abs_rel, rmse = float(np.mean(np.abs(d - truth) / truth)), float(np.sqrt(np.mean((d - truth) ** 2)))
+    return DepthScore(len(d), abs_rel, rmse, float(np.sqrt(np.mean(np.log(d / truth) ** 2))), *deltas, scale)
 
 
 def report_depth(prediction: FloatArray, truth: FloatArray, image: NDArray[np.uint8] | None = None) -> DepthReport:
@@ -106,6 +113,19 @@ def mean_score(scores: Iterable[DepthScore]) -> DepthScore:
     names = ("abs_rel", "rmse_m", "log_rmse", "delta1", "delta2", "delta3", "scale")
     means = {name: float(np.mean([getattr(s, name) for s in found])) for name in names}
     return DepthScore(pixels=sum(s.pixels for s in found), **means)
+
+
+def mean_report(reports: Iterable[DepthReport]) -> DepthReport:
+    """Mean over maps of all four figures; edges over the maps that have any."""
+    found = list(reports)
+    edges = [r.edges_metric for r in found if r.edges_metric is not None]
+    scaled = [r.edges_median_scaled for r in found if r.edges_median_scaled is not None]
+    return DepthReport(
+        mean_score(r.metric for r in found),
+        mean_score(r.median_scaled for r in found),
+        mean_score(edges) if edges else None,
+        mean_score(scaled) if scaled else None,
+    )
 
 
 def read_depth(path: Path, metres_per_unit: float = 1.0 / 5000.0) -> FloatArray:
@@ -142,15 +162,17 @@ def compare_folders(
     if prediction.is_file() and truth.is_file():
         pairs = [(prediction, truth, images)]
     else:
-        known, pictures = _maps(truth), _images(images)
-        pairs = [(path, known[n], pictures.get(n)) for n, path in _maps(prediction).items() if n in known]
+        known, pictures = _named(truth, _MAPS), {} if images is None else _named(images, _PICTURES)
+        pairs = [(path, known[n], pictures.get(n)) for n, path in _named(prediction, _MAPS).items() if n in known]
     if not pairs:
         raise EvaluationError(
             f"{prediction} and {truth} share no depth map by name (.npy or 16-bit .png); for predictions named after "
             "a recording's colour images, give the recording's own folder as ground truth"
         )
     return mean_report(
-        report_depth(read_depth(a, metres_per_unit), read_depth(b, metres_per_unit), _read_image(image))
+        report_depth(
+            read_depth(a, metres_per_unit), read_depth(b, metres_per_unit), None if image is None else _grey(image)
+        )
         for a, b, image in pairs
     )
 
@@ -164,16 +186,13 @@ def compare_with_recording(prediction: Path, folder: Path) -> DepthReport:
     Raises:
         EvaluationError: If the recording has no depth maps, or none belongs to a prediction.
     """
-    measured = open_depth(folder)
-    maps = _maps(prediction)
-    reports = []
+    measured, maps, reports = open_depth(folder), _named(prediction, _MAPS), []
     for stamp, path in zip(measured.frame_stamps_s, measured.image_paths, strict=True):
         index = int(nearest(measured.maps.stamps_s, np.array([stamp]))[0])
         if path.stem not in maps or abs(measured.maps.stamps_s[index] - stamp) > DEFAULT_MAX_DT_S:
             continue
         truth = measured.maps.read_registered(index, measured.camera)
-        image = _read_image(path)
-        image = None if image is None else np.asarray(measured.camera.undistort_image(image), np.uint8)
+        image = np.asarray(measured.camera.undistort_image(_grey(path)), np.uint8)
         reports.append(report_depth(read_depth(maps[path.stem], 1e-3), truth, image))
     if not reports:
         raise EvaluationError(
@@ -183,79 +202,16 @@ def compare_with_recording(prediction: Path, folder: Path) -> DepthReport:
     return mean_report(reports)
 
 
-def mean_report(reports: Iterable[DepthReport]) -> DepthReport:
-    """Mean over maps of all four figures; edges over the maps that have any."""
-    found = list(reports)
-    edges = [r.edges_metric for r in found if r.edges_metric is not None]
-    scaled = [r.edges_median_scaled for r in found if r.edges_median_scaled is not None]
-    return DepthReport(
-        mean_score(r.metric for r in found),
-        mean_score(r.median_scaled for r in found),
-        mean_score(edges) if edges else None,
-        mean_score(scaled) if scaled else None,
-    )
-
-
-def _maps(place: Path) -> dict[str, Path]:
-    """Depth maps of a folder by name; ``.npy`` before ``.png``; coloured pictures are ignored."""
+def _named(place: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
+    """Files of a folder by name, later suffixes before others; coloured pictures of depth are ignored."""
     if place.is_file():
         return {place.stem: place}
-    found = {p.stem: p for suffix in (".png", ".npy") for p in sorted(place.glob(f"*{suffix}"))}
+    found = {p.stem: p for s in suffixes for p in sorted(place.iterdir()) if p.suffix.lower() == s}
     return {name: path for name, path in sorted(found.items()) if not name.endswith(("_colour", "_sigma"))}
 
 
-def _images(place: Path | None) -> dict[str, Path]:
-    if place is None:
-        return {}
-    return {p.stem: p for p in sorted(place.glob("*")) if p.suffix.lower() in (".png", ".jpg", ".jpeg")}
-
-
-def _read_image(path: Path | None) -> NDArray[np.uint8] | None:
-    if path is None:
-        return None
+def _grey(path: Path) -> NDArray[np.uint8]:
     image = pixels_or_none(path, cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise EvaluationError(f"{path}: not an image")
     return np.asarray(image, dtype=np.uint8)
-
-
-def markdown_depth(report: DepthReport) -> str:
-    """The figures as a table."""
-    lines = [
-        "| pixels | AbsRel | RMSE [m] | log RMSE | delta1 | delta2 | delta3 | scale |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for name, s in (
-        ("metric", report.metric),
-        ("median-scaled", report.median_scaled),
-        ("edges, metric", report.edges_metric),
-        ("edges, median-scaled", report.edges_median_scaled),
-    ):
-        if s is not None:
-            lines.append(
-                f"| {name} | {s.abs_rel:.4f} | {s.rmse_m:.4f} | {s.log_rmse:.4f} | {s.delta1:.4f} | {s.delta2:.4f} "
-                f"| {s.delta3:.4f} | {s.scale:.4f} |"
-            )
-    return "\n".join(lines)
-
-
-def _score(d: FloatArray, truth: FloatArray, median_scaled: bool) -> DepthScore:
-    if len(d) == 0:
-        raise EvaluationError("no pixel has both a measured and a predicted depth")
-    d, truth = d.astype(np.float64), truth.astype(np.float64)
-    middle = float(np.median(d))
-    if median_scaled and middle <= 0:
-        raise EvaluationError("the predicted depth map is not positive")
-    scale = float(np.median(truth)) / middle if median_scaled else 1.0
-    d = np.maximum(d * scale, MIN_DEPTH_M)
-    ratio = np.maximum(d / truth, truth / d)
-    return DepthScore(
-        pixels=len(d),
-        abs_rel=float(np.mean(np.abs(d - truth) / truth)),
-        rmse_m=float(np.sqrt(np.mean((d - truth) ** 2))),
-        log_rmse=float(np.sqrt(np.mean((np.log(d) - np.log(truth)) ** 2))),
-        delta1=float(np.mean(ratio < 1.25)),
-        delta2=float(np.mean(ratio < 1.25**2)),
-        delta3=float(np.mean(ratio < 1.25**3)),
-        scale=scale,
-    )

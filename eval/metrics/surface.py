@@ -19,39 +19,23 @@ from edgeslam_torch.types import FloatArray
 
 MAX_DEPTH_M = 5.0
 """A Kinect's noise grows with the square of the distance: 7 cm at 5 m (Khoshelham & Elberink 2012)."""
-
 MAX_EDGE_DEPTH_M = 4.0
 """Maximum depth of reference edges: beyond it, measured depth is worse than the 6 cm tolerance."""
-
 _STRIDE = 2
 """Every second pixel of both directions: 8 mm at 2 m."""
-
-_VOXEL_M = 0.005
-"""The fused cloud keeps one point of each cube of this size."""
-
-_EDGE_VOXEL_M = 0.015
-"""Edge points of several depth maps in one cube of this size are one edge point, at their mean."""
-
+_VOXEL_M, _EDGE_VOXEL_M = 0.005, 0.015
+"""The fused cloud keeps one point of each cube of the first size; edge points in one cube of the second are one."""
 _EDGE_MAPS = 3
 """Number of depth maps that must place a reference edge in the same cube, to exclude flicker and noisy depth."""
-
-_EDGE_FRAMES = 40
-"""Depth maps used for reference edges, evenly spaced over the sequence."""
-
-_SINGLE_FRAMES = 30
-"""Depth maps that judge a point one by one, spread evenly over the sequence."""
-
+_EDGE_FRAMES, _SINGLE_FRAMES = 40, 30
+"""Depth maps used for reference edges, and to judge a point one by one, evenly spaced over the sequence."""
 _HIDDEN_M = 0.1
 """A point this far behind a depth map's surface is hidden there and cannot be compared with that map."""
-
 _CANNY = (50.0, 150.0)
 """Canny thresholds of the reference edges, on the grey image smoothed with sigma 1, L2 gradient."""
-
-_HOLE_PX = 4
-"""Minimum distance of reference edges from unmeasured pixels, where depth is unreliable."""
-
-_NEAR_PX = 2
-"""Depth of an edge is the nearest within this many pixels: the edge belongs to the occluding side."""
+_HOLE_PX, _NEAR_PX = 4, 2
+"""Distance of reference edges from unmeasured pixels, where depth is unreliable, at least; and that within which the
+nearest depth is an edge's: it belongs to the occluding side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,24 +81,20 @@ class SurfaceTruth:
         for k, (depth, T) in enumerate(zip(self.depth_m[::step], self.T_d_w[::step], strict=True)):
             p_d = se3.transform(T, p_w)
             index, reading = self._readings(depth, p_d)
-            tree = cKDTree(_points(depth, self.camera, np.eye(4)), balanced_tree=False, compact_nodes=False)
-            distance = tree.query(p_d[index])[0].astype(np.float32)
+            distance = _tree(_points(depth, self.camera, np.eye(4))).query(p_d[index])[0].astype(np.float32)
             behind = p_d[index, 2] > reading + _HIDDEN_M
             found[index[~behind], k] = distance[~behind]
             hidden[index[behind]] = np.minimum(hidden[index[behind]], distance[behind])
-        out = np.full(len(p_w), np.nan, dtype=np.float32)
+        out = np.where(np.isfinite(hidden), hidden, np.float32(np.nan))
         some = ~np.isnan(found).all(axis=1)
         out[some] = np.nanmedian(found[some], axis=1)
-        rest = ~some & np.isfinite(hidden)
-        out[rest] = hidden[rest]
         return out
 
     def _readings(self, depth: FloatArray, p_d: FloatArray) -> tuple[np.ndarray, FloatArray]:
         """Which points ``(N, 3)`` of the depth camera's frame fall on a measured pixel, and the depth there."""
         index = np.flatnonzero(p_d[:, 2] > 0.1)
         uv = np.rint(self.camera.project(p_d[index])).astype(np.int64)
-        height, width = depth.shape
-        inside = (uv[:, 0] >= 0) & (uv[:, 0] < width) & (uv[:, 1] >= 0) & (uv[:, 1] < height)
+        inside = ((uv >= 0) & (uv < depth.shape[::-1])).all(axis=1)
         index, uv = index[inside], uv[inside]
         reading = depth[uv[:, 1], uv[:, 0]]
         return index[reading > 0], reading[reading > 0]
@@ -141,25 +121,23 @@ def build_surface(dataset: EvalDataset) -> SurfaceTruth:
         raise EvaluationError(f"{dataset.folder}: no depth map has a true pose at its time")
     edge_index = set(index[:: max(1, len(index) // _EDGE_FRAMES)].tolist())
     camera = measured.taken_by(colour)
-    small = camera.scaled(camera.width // _STRIDE, camera.height // _STRIDE)
     # Pixels are taken, not averaged: sub-pixel phase 0 of every stride, hence the plain division below.
-    small = Camera(small.width, small.height, *_strided(camera), source=camera.source)
+    strided = (value / _STRIDE for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    small = Camera(camera.width // _STRIDE, camera.height // _STRIDE, *strided, source=camera.source)
     clouds, edges, maps = [], [], []
     for i in index:
         depth = measured.read(int(i), colour)
         depth[depth > MAX_DEPTH_M] = 0.0
         maps.append(depth[::_STRIDE, ::_STRIDE].copy())
-        clouds.append(_thinned(_points(maps[-1], small, T_w_d[i]), _VOXEL_M))
+        clouds.append(_thinned(_points(maps[-1], small, T_w_d[i])))
         if i in edge_index:
             edges.append(_edge_points(dataset, measured, depth, int(i)))
-    cloud = _thinned(np.concatenate(clouds), _VOXEL_M)
-    edge_cloud = _agreed(edges)
-    tree = cKDTree(cloud, balanced_tree=False, compact_nodes=False)
-    return SurfaceTruth(tree, edge_cloud, np.stack(maps), se3.inverse(T_w_d[index]), small)
+    tree = _tree(_thinned(np.concatenate(clouds)))
+    return SurfaceTruth(tree, _agreed(edges), np.stack(maps), se3.inverse(T_w_d[index]), small)
 
 
-def _strided(camera: Camera) -> tuple[float, float, float, float]:
-    return camera.fx / _STRIDE, camera.fy / _STRIDE, camera.cx / _STRIDE, camera.cy / _STRIDE
+def _tree(p: FloatArray) -> cKDTree:
+    return cKDTree(p, balanced_tree=False, compact_nodes=False)
 
 
 def _points(depth: FloatArray, camera: Camera, T_w_d: FloatArray) -> FloatArray:
@@ -168,9 +146,9 @@ def _points(depth: FloatArray, camera: Camera, T_w_d: FloatArray) -> FloatArray:
     return se3.transform(T_w_d, p).astype(np.float32)
 
 
-def _thinned(p: FloatArray, voxel_m: float) -> FloatArray:
+def _thinned(p: FloatArray) -> FloatArray:
     """One point of each cube; the first in order."""
-    return p[np.sort(np.unique(_cells(p, voxel_m), return_index=True)[1])]
+    return p[np.sort(np.unique(_cells(p, _VOXEL_M), return_index=True)[1])]
 
 
 def _cells(p: FloatArray, voxel_m: float) -> np.ndarray:
@@ -187,8 +165,7 @@ def _agreed(edges: list[FloatArray]) -> FloatArray:
     frame = np.repeat(np.arange(len(edges)), [len(e) for e in edges])
     _, cell = np.unique(_cells(p, _EDGE_VOXEL_M), return_inverse=True)
     maps = np.bincount(np.unique(cell * len(edges) + frame) // len(edges))
-    total = np.bincount(cell)
-    mean = np.stack([np.bincount(cell, weights=p[:, axis]) for axis in range(3)], axis=1) / total[:, None]
+    mean = np.stack([np.bincount(cell, weights=axis) for axis in p.T], axis=1) / np.bincount(cell)[:, None]
     return mean[maps >= min(_EDGE_MAPS, len(edges))].astype(np.float32)
 
 
@@ -205,12 +182,13 @@ def _edge_points(dataset: EvalDataset, measured: DepthMaps, depth: FloatArray, i
     T_c_d, camera = measured.T_c_d, dataset.camera
     if not measured.is_registered:
         depth = register_depth(depth, measured.taken_by(camera), T_c_d, camera)
-    image = camera.undistort_image(image)
-    canny = cv2.Canny(cv2.GaussianBlur(image, (0, 0), 1.0), *_CANNY, L2gradient=True) > 0
-    has_depth = np.where(depth > 0, 1, 0).astype(np.uint8)
-    solid = cv2.erode(has_depth, np.ones((2 * _HOLE_PX + 1,) * 2, np.uint8), borderValue=0) > 0
-    near = cv2.erode(np.where(depth > 0, depth, np.float32(1e3)), np.ones((2 * _NEAR_PX + 1,) * 2, np.uint8))
-    v, u = np.nonzero(canny & solid & (near < MAX_EDGE_DEPTH_M))
-    p_c = camera.back_project(np.stack([u, v], axis=1).astype(np.float64), np.asarray(near, dtype=np.float64)[v, u])
+    image = cv2.GaussianBlur(camera.undistort_image(image), (0, 0), 1.0)
+    canny = cv2.Canny(image, *_CANNY, L2gradient=True) > 0
+    hole, near = (np.ones((2 * px + 1,) * 2, np.uint8) for px in (_HOLE_PX, _NEAR_PX))
+    solid = cv2.erode((depth > 0).astype(np.uint8), hole, borderValue=0) > 0
+    nearest_m = cv2.erode(np.where(depth > 0, depth, np.float32(1e3)), near)
+    v, u = np.nonzero(canny & solid & (nearest_m < MAX_EDGE_DEPTH_M))
+    z = np.asarray(nearest_m, dtype=np.float64)[v, u]
+    p_c = camera.back_project(np.stack([u, v], axis=1).astype(np.float64), z)
     # The truth is the pose of the depth camera where the two differ.
     return se3.transform(T_w_image[0] @ se3.inverse(T_c_d), p_c).astype(np.float32)

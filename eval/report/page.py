@@ -40,7 +40,7 @@ _MAX_POSES = 6000
 _MAX_KEYFRAMES = 12
 _KEYFRAME_WIDTH_PX = 480
 _MAX_FRUSTA = 60
-_PAGE = Path(__file__).parent / "template"
+TEMPLATE = Path(__file__).parent / "template"
 _SCRIPTS = ("data.js", "viewer.js", "charts.js", "page.js")
 
 
@@ -93,9 +93,9 @@ def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | No
     turn = upright(run.trajectory, score, truth) if run.up == "unknown" else np.eye(3)
     data, packed_edges, packed_anchors = _payload(run, edges, anchors, score, truth, turn)
     text = json.dumps(finite(data), allow_nan=False, separators=(",", ":"), default=_plain).replace("<", "\\u003c")
-    script = "\n".join((_PAGE / name).read_text(encoding="utf-8") for name in _SCRIPTS)
+    script = "\n".join((TEMPLATE / name).read_text(encoding="utf-8") for name in _SCRIPTS)
     parts = {
-        "style": (_PAGE / "style.css").read_text(encoding="utf-8"),
+        "style": (TEMPLATE / "style.css").read_text(encoding="utf-8"),
         "script": script,
         "title": html.escape(f"{data['title']}, EdgeSLAM-Torch"),
         "edges": packed_edges,
@@ -104,7 +104,7 @@ def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | No
         "flight": flight_section(run.source),
     }
     # In one pass: a recording may itself be called {{edges}}.
-    page = (_PAGE / "page.html").read_text(encoding="utf-8")
+    page = (TEMPLATE / "page.html").read_text(encoding="utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], page)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.eval.metrics.common_frames import CommonScore
+from edgeslam_torch.eval.metrics.depth_error import DepthReport
 from edgeslam_torch.eval.metrics.edge_map_score import THRESHOLDS_M
 from edgeslam_torch.eval.metrics.run_score import RunScore
 
@@ -135,6 +136,21 @@ def report_of_two(first: RunScore, second: RunScore) -> str:
     lines += [text_table(["", "A", "B", "B - A"], rows), ""]
     lines += [f"- {letter}: {note}" for letter, s in zip("AB", (first, second), strict=True) for note in _notes(s)]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def depth_report(report: DepthReport) -> str:
+    """Figures of depth maps."""
+    rows = [
+        [name, *(f"{v:.4f}" for v in (s.abs_rel, s.rmse_m, s.log_rmse, s.delta1, s.delta2, s.delta3, s.scale))]
+        for name, s in (
+            ("metric", report.metric),
+            ("median-scaled", report.median_scaled),
+            ("edges, metric", report.edges_metric),
+            ("edges, median-scaled", report.edges_median_scaled),
+        )
+        if s is not None
+    ]
+    return markdown_table(["pixels", "AbsRel", "RMSE [m]", "log RMSE", "delta1", "delta2", "delta3", "scale"], rows)
 
 
 def common_report(scores: Sequence[CommonScore], markdown: bool = False) -> str:

@@ -18,6 +18,23 @@ _LEADING = re.compile(
 """A path from the root or from folders above, up to its last name; folders may have spaces inside their names."""
 
 
+def number(value: object) -> float:
+    """A value of a file that may hold anything as a number; NaN if it is none."""
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def record(value: object) -> dict[str, Any]:
+    """The same as a record; empty if it is none."""
+    return value if isinstance(value, dict) else {}
+
+
+def _count(value: object) -> int:
+    return int(number(value)) if math.isfinite(number(value)) else 0
+
+
 def unit(run: RunFolder) -> str:
     """``m``, or ``units`` while the scale is unknown."""
     return "units" if run.units == "arbitrary" else "m"
@@ -26,9 +43,10 @@ def unit(run: RunFolder) -> str:
 def title(run: RunFolder) -> str:
     """Name of the recording, else of the folder."""
     source = run.summary.get("source")
-    if isinstance(source, dict) and isinstance(source.get("name"), str) and source["name"]:
-        return readable(source["name"])
-    path = source.get("path") if isinstance(source, dict) else source
+    source = source if isinstance(source, dict) else {"path": source}
+    if isinstance(name := source.get("name"), str) and name:
+        return readable(name)
+    path = source.get("path")
     return readable(Path(path).name if isinstance(path, str) and path else run.name)
 
 
@@ -44,42 +62,44 @@ def without_folders(text: str) -> str:
 
 def story(run: RunFolder, score: RunScore | None) -> str:
     """What was run and how it went."""
-    summary, sentences = run.summary, []
-    frames = _offered(run) or len(run.trajectory)
+    summary, frames = run.summary, _offered(run) or len(run.trajectory)
     seconds = float(run.trajectory.stamps_s[-1] - run.trajectory.stamps_s[0])
-    tracked = run.trusted_frames
-    sentences.append(f"{frames} frames, {seconds:.1f} s of recording.")
-    for key, words in (("left_out", "left out: they could not be used"), ("dropped_frames", "dropped to keep up")):
+    sentences = [f"{frames} frames, {seconds:.1f} s of recording."]
+    for key, what in (("left_out", "left out: they could not be used"), ("dropped_frames", "dropped to keep up")):
         if _count(summary.get(key)):
-            sentences.append(f"{_count(summary.get(key))} of them were {words}.")
+            sentences.append(f"{_count(summary.get(key))} of them were {what}.")
     if run.status:
-        share = 100.0 * tracked / max(1, frames)
-        lost = summary.get("lost_events")
-        if tracked < frames:
-            sentences.append(f"{share:.1f} % of the frames were tracked against the map{_first(run)}.")
-        elif lost:  # each was given its place by the end
-            sentences.append(f"Every frame has a place in the final map{_first(run)}.")
-        else:
-            sentences.append(f"Every frame was tracked against the map{_first(run)}.")
-        if isinstance(lost, int) and (lost or tracked):
-            sentences.append(
-                f"While running, tracking was lost {_times(lost)}." if lost else "Tracking was never lost."
-            )
-    sentences.append(_scale_sentence(summary))
-    sentences.append(_pieces_sentence(summary))
-    sentences.append(_found_again_sentence(summary))
+        sentences += _tracking(run, frames)
+    sentences += [_scale_sentence(summary), _pieces_sentence(summary), _found_again_sentence(summary)]
     if score is not None:
         sentences.append(
             f"Against ground truth the camera is off by {_length(score.ate_sim3_m)} (RMSE after scaling; a camera that "
             f"never moved would score {_length(score.fixed_position_m)})."
         )
         if score.units == "metres":
-            sentences.append(
-                f"Without scaling it is {_length(score.ate_se3_m)}; lengths are {_scale_words(score.scale_error)}."
-            )
+            off = abs(1.0 / (1.0 + score.scale_error) - 1.0)
+            words = f"{100 * off:.1f} % too {'small' if score.scale_error > 0 else 'large'}"
+            sentences.append(f"Without scaling it is {_length(score.ate_se3_m)}; lengths are {words}.")
     if summary.get("interrupted"):
         sentences.append("The run was interrupted; this is what was done until then.")
     return " ".join(s for s in sentences if s).replace(" %", "\u00a0%")
+
+
+def _tracking(run: RunFolder, frames: int) -> list[str]:
+    """How much was tracked, from when on, and how often tracking was lost."""
+    tracked, lost = run.trusted_frames, run.summary.get("lost_events")
+    first = next((index for index, row in enumerate(run.status) if is_supported(row)), None)
+    begin = {None: "", 0: ", from the first on"}.get(first, f", the first of them frame {first}")
+    if tracked < frames:
+        sentences = [f"{100.0 * tracked / max(1, frames):.1f} % of the frames were tracked against the map{begin}."]
+    elif lost:  # each was given its place by the end
+        sentences = [f"Every frame has a place in the final map{begin}."]
+    else:
+        sentences = [f"Every frame was tracked against the map{begin}."]
+    if isinstance(lost, int) and (lost or tracked):
+        times = {1: "once", 2: "twice"}.get(lost, f"{lost} times")
+        sentences.append(f"While running, tracking was lost {times}." if lost else "Tracking was never lost.")
+    return sentences
 
 
 def warnings(summary: dict[str, Any]) -> list[str]:
@@ -90,46 +110,32 @@ def warnings(summary: dict[str, Any]) -> list[str]:
 
 def tiles(run: RunFolder, score: RunScore | None, points: int) -> list[dict[str, str]]:
     """Key figures at the top of the page."""
-    summary = run.summary
-    out: list[dict[str, str]] = []
-
-    def add(value: str, unit_: str, label: str) -> None:
-        out.append({"value": value, "unit": unit_, "label": label})
-
+    summary, frames = run.summary, _offered(run)
+    out: list[tuple[str, str, str]] = []
     if score is not None:
-        add(f"{100 * score.ate_sim3_m:.2f}", "cm", "position error (ATE, Sim(3))")
+        out.append((f"{100 * score.ate_sim3_m:.2f}", "cm", "position error (ATE, Sim(3))"))
         if score.map is not None:
-            add(f"{100 * score.map.median_m:.2f}", "cm", "map error (median)")
-    frames = _offered(run)
+            out.append((f"{100 * score.map.median_m:.2f}", "cm", "map error (median)"))
     if frames and run.status:
-        add(f"{100 * run.trusted_frames / frames:.1f}", "%", "frames tracked")
+        out.append((f"{100 * run.trusted_frames / frames:.1f}", "%", "frames tracked"))
     if points:
-        add(f"{points:,}".replace(",", "\u2009"), "", "map points shown")
-    scale = summary.get("scale")
-    if isinstance(scale, dict):
-        value, sigma = _float(scale.get("value")), _float(scale.get("sigma"))
-        if scale.get("units") == "arbitrary" or not math.isfinite(sigma):
-            add("unknown", "", "scale")
-        else:
-            add(f"\u00b1{100 * sigma / value:.1f}" if value else "?", "%", "scale, 1 sigma")
-    up = summary.get("up")
-    if isinstance(up, dict):
-        sigma_deg = _float(up.get("sigma_deg"))
-        known = math.isfinite(sigma_deg)
-        add(
-            f"\u00b1{sigma_deg:.1f}" if known else "unknown",
-            "\u00b0" if known else "",
-            "up, 1 sigma" if known else "up",
-        )
-    for key, name, text in (
-        ("fps", "frames per second", "{:.1f}"),
-        ("cpu_ms_per_frame", "CPU per frame", "{:.0f}"),
-        ("peak_rss_mb", "memory", "{:.0f}"),
+        out.append((f"{points:,}".replace(",", "\u2009"), "", "map points shown"))
+    if isinstance(scale := summary.get("scale"), dict):
+        value, sigma = number(scale.get("value")), number(scale.get("sigma"))
+        known = scale.get("units") != "arbitrary" and math.isfinite(sigma)
+        share = f"\u00b1{100 * sigma / value:.1f}" if value else "?"
+        out.append((share, "%", "scale, 1 sigma") if known else ("unknown", "", "scale"))
+    if isinstance(up := summary.get("up"), dict):
+        sigma = number(up.get("sigma_deg"))
+        out.append((f"\u00b1{sigma:.1f}", "\u00b0", "up, 1 sigma") if math.isfinite(sigma) else ("unknown", "", "up"))
+    for key, unit_, name, text in (
+        ("fps", "", "frames per second", "{:.1f}"),
+        ("cpu_ms_per_frame", "ms", "CPU per frame", "{:.0f}"),
+        ("peak_rss_mb", "MB", "memory", "{:.0f}"),
     ):
-        value = _float(summary.get(key))
-        if math.isfinite(value):
-            add(text.format(value), {"fps": "", "cpu_ms_per_frame": "ms", "peak_rss_mb": "MB"}[key], name)
-    return out
+        if math.isfinite(value := number(summary.get(key))):
+            out.append((text.format(value), unit_, name))
+    return [{"value": value, "unit": unit_, "label": label} for value, unit_, label in out]
 
 
 def foot(run: RunFolder) -> str:
@@ -137,17 +143,14 @@ def foot(run: RunFolder) -> str:
     parts = ["Made by EdgeSLAM-Torch"]
     for key in ("version", "commit", "mode", "seed", "camera", "command", "started"):
         value = run.summary.get(key)
-        if isinstance(value, dict):
-            value = value.get("source")
-        if value not in (None, ""):
-            parts.append(f"{key} {without_folders(str(value))}")
+        value = value.get("source") if isinstance(value, dict) else value
+        parts += [f"{key} {without_folders(str(value))}"] if value not in (None, "") else []
     return ", ".join(parts) + "."
 
 
 def scale_note(summary: dict[str, Any]) -> str:
     """Where the scale comes from."""
-    scale = summary.get("scale")
-    if not isinstance(scale, dict):
+    if not isinstance(scale := summary.get("scale"), dict):
         return ""
     source = str(scale.get("source", "none"))
     return "No source of metric scale." if source == "none" else f"Source: {source.replace('+', ' and ')}."
@@ -189,33 +192,22 @@ def flat_rows(summary: dict[str, Any], prefix: str = "") -> list[list[str]]:
         name = f"{prefix}{key}".replace("_", " ")
         if isinstance(value, dict):
             rows += flat_rows(value, f"{prefix}{key}: ")
-        elif isinstance(value, float):
-            rows.append([name, f"{value:.6g}"])
         else:
-            rows.append([name, without_folders(_flat(value))])
+            rows.append([name, f"{value:.6g}" if isinstance(value, float) else without_folders(_flat(value))])
     return rows
 
 
 def keyframe_label(stem: str, begin: float) -> str:
     """Caption of a keyframe picture: its time into the run when its name is a stamp."""
-    value = _float(stem)
-    if math.isfinite(value) and "." in stem and value >= begin:
-        return f"{value - begin:.2f} s"
-    return stem.replace("_", " ")
-
-
-def _first(run: RunFolder) -> str:
-    for index, row in enumerate(run.status):
-        if is_supported(row):
-            return ", from the first on" if index == 0 else f", the first of them frame {index}"
-    return ""
+    value = number(stem)
+    is_stamp = math.isfinite(value) and "." in stem and value >= begin
+    return f"{value - begin:.2f} s" if is_stamp else stem.replace("_", " ")
 
 
 def _scale_sentence(summary: dict[str, Any]) -> str:
-    scale = summary.get("scale")
-    if not isinstance(scale, dict):
+    if not isinstance(scale := summary.get("scale"), dict):
         return ""
-    value, sigma, source = _float(scale.get("value")), _float(scale.get("sigma")), str(scale.get("source", "none"))
+    value, sigma, source = number(scale.get("value")), number(scale.get("sigma")), str(scale.get("source", "none"))
     if scale.get("units") == "arbitrary" or not math.isfinite(sigma) or not value:
         return "No source determined the metric scale, so lengths are in arbitrary units."
     known = f"{100 * sigma / value:.1f} % (1 sigma) from {source.replace('+', ' and ')}"
@@ -228,7 +220,7 @@ def _pieces_sentence(summary: dict[str, Any]) -> str:
     if len(pieces) < 2:
         return ""
     spans = ", ".join(
-        f"piece {p.get('number')} from {_float(p.get('first_s')):.1f} to {_float(p.get('last_s')):.1f} s"
+        f"piece {p.get('number')} from {number(p.get('first_s')):.1f} to {number(p.get('last_s')):.1f} s"
         for p in pieces
     )
     return (
@@ -241,14 +233,8 @@ def _found_again_sentence(summary: dict[str, Any]) -> str:
     """Joins of pieces and closed loops, with their evidence."""
     said = [text for key in ("joins", "loops") if isinstance(found := summary.get(key), list) for text in found]
     said = [text for text in said if isinstance(text, str) and text]
-    if not said:
-        return ""
     more = f"; and {len(said) - _MOST_SAID} more" if len(said) > _MOST_SAID else ""
-    return f"Places were seen again: {'; '.join(said[:_MOST_SAID])}{more}."
-
-
-def _times(count: int) -> str:
-    return {1: "once", 2: "twice"}.get(count, f"{count} times")
+    return f"Places were seen again: {'; '.join(said[:_MOST_SAID])}{more}." if said else ""
 
 
 def _length(metres: float) -> str:
@@ -257,34 +243,13 @@ def _length(metres: float) -> str:
     return f"{100 * metres:.1f}\u00a0cm" if metres < 1.0 else f"{metres:.2f}\u00a0m"
 
 
-def _scale_words(scale_error: float) -> str:
-    """The estimate must be multiplied by ``1 + scale_error``: a positive one means that it is too small."""
-    off = abs(1.0 / (1.0 + scale_error) - 1.0)
-    return f"{100 * off:.1f} % too {'small' if scale_error > 0 else 'large'}"
-
-
-def _float(value: object) -> float:
-    try:
-        return float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError):
-        return float("nan")
-
-
 def _flat(value: object) -> str:
     """A list, or a list of records, without brackets and quotes."""
     if isinstance(value, list):
         return "; ".join(_flat(item) for item in value) or "none"
-    if isinstance(value, dict):
-        return ", ".join(f"{key} {item}" for key, item in value.items())
-    return str(value)
+    return ", ".join(f"{key} {item}" for key, item in value.items()) if isinstance(value, dict) else str(value)
 
 
 def _offered(run: RunFolder) -> int:
     """Frames that the source had: run through, left out and dropped; as the terminal counts them."""
     return _count(run.summary.get("offered")) or _count(run.summary.get("frames")) or len(run.status)
-
-
-def _count(value: object) -> int:
-    """An integer; 0 if invalid."""
-    number = _float(value)
-    return int(number) if math.isfinite(number) else 0

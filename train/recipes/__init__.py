@@ -1,1 +1,1 @@
-"""Training that goes on from given weights, with more places and the mean of both."""
+"""Recipes of weights that come with the package, beside `default_weights`."""

@@ -125,7 +125,7 @@ def _fetched(args: argparse.Namespace) -> tuple[Path, list[str]]:
 def _navigation(args: argparse.Namespace) -> int:
     """Flights through named worlds; 1 when one touched something, or failed."""
     from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, is_corridor
-    from edgeslam_torch.eval.judge.navigation.flight import Case
+    from edgeslam_torch.eval.judge.navigation.flown import Case
     from edgeslam_torch.eval.judge.navigation.perception import FAULTS
     from edgeslam_torch.eval.judge.navigation.table import FAILED, judge_flights, markdown
     from edgeslam_torch.synthetic.sites.build import JUDGED, SITES

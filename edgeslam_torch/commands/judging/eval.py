@@ -164,7 +164,8 @@ def one_groundtruth(truths: list[Path]) -> Path:
 def _depth_maps(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from edgeslam_torch.eval.metrics.depth_error import compare_folders, compare_with_recording, markdown_depth
+    from edgeslam_torch.eval.metrics.depth_error import compare_folders, compare_with_recording
+    from edgeslam_torch.eval.report.tables import depth_report
 
     truth = args.groundtruth
     if truth is None:
@@ -173,7 +174,7 @@ def _depth_maps(args: argparse.Namespace) -> int:
         reports = {str(run): compare_with_recording(run, truth) for run in args.runs}
     else:
         reports = {str(run): compare_folders(run, truth, 1.0 / args.depth_unit, args.images) for run in args.runs}
-    text = "\n".join(f"{name}\n\n{markdown_depth(report)}\n" for name, report in reports.items())
+    text = "\n".join(f"{name}\n\n{depth_report(report)}\n" for name, report in reports.items())
     print(text)
     try:
         if args.markdown is not None:

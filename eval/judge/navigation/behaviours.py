@@ -2,19 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from edgeslam_torch.eval.judge.navigation.flown import Flown
 from edgeslam_torch.flying.tasks import WayHome
 from edgeslam_torch.navigation.corridor.follow import FollowCorridor
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.navigation.tasks import Explore, GoTo, Task
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
-
-if TYPE_CHECKING:
-    from edgeslam_torch.eval.judge.navigation.flight import Flown
 
 REACHED_M = 0.35
 """Distance to the true goal that counts as reached when the planner reports it."""
@@ -44,7 +41,7 @@ class Behaviour:
     """Tasks and their success criterion."""
 
     steps: tuple[Callable[[Moment], Task], ...]
-    reached: Callable[["Flown", Site], bool]
+    reached: Callable[[Flown, Site], bool]
     """Whether a flight that completed its last task without contact reached its goal."""
     limit_s: float = 120.0
 
@@ -57,11 +54,11 @@ def _home(moment: Moment) -> Task:
     return WayHome(moment.track_w)
 
 
-def _at_home(flown: "Flown", site: Site) -> bool:
+def _at_home(flown: Flown, site: Site) -> bool:
     return flown.home_m < HOME_M
 
 
-def _at_an_end(flown: "Flown", site: Site) -> bool:
+def _at_an_end(flown: Flown, site: Site) -> bool:
     here = np.array(flown.track_w[-1][:2])
     return bool(min(np.linalg.norm(here - end) for end in corridor_ends(site)) < _END_M)
 

@@ -1,9 +1,9 @@
-"""One judged flight: its case and result; flown in lockstep, or over UDP in real time."""
+"""One judged flight, in lockstep or over UDP in real time."""
 
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from edgeslam_torch.drone.emulator.lockstep import LockstepTello
 from edgeslam_torch.drone.emulator.room import drone_at
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, Behaviour, Moment, right_exits
+from edgeslam_torch.eval.judge.navigation.flown import PERCEPTIONS, Case, Flown
 from edgeslam_torch.eval.judge.navigation.perception import (
     DEPTH_SIZE,
     FAULTS,
@@ -43,108 +44,23 @@ _SIGMAS, _NO_HARM_M = 3.0, 0.1
 """Bound of a consistent pose error: standard deviations, plus the hull's radius."""
 _FREE_M = 0.6
 """Clearance above which the cruising speed is measured."""
-PERCEPTIONS = ("truth", "slam", "udp")
-"""Source of the planner's states: true pose and depth, or the SLAM; the SLAM over UDP in real time."""
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
-    """One case."""
+def check(case: Case) -> None:
+    """Refuse names that do not exist.
 
-    world: str
-    seed: int
-    fault: str = "none"
-    perception: str = "truth"
-    """One of `PERCEPTIONS`."""
-    behaviour: str = "goto"
-    """One of `behaviours.BEHAVIOURS`."""
-
-    @property
-    def name(self) -> str:
-        """Of its files."""
-        name = f"{self.world}_{self.seed}_{self.fault}_{self.perception}"
-        return name if self.behaviour == "goto" else f"{name}_{self.behaviour}"
-
-    def check(self) -> None:
-        """Refuse names that do not exist.
-
-        Raises:
-            EvaluationError: If one does not.
-        """
-        for what, names in (
-            ("world", SITES),
-            ("fault", FAULTS),
-            ("behaviour", BEHAVIOURS),
-            ("perception", PERCEPTIONS),
-        ):
-            if getattr(self, what) not in names:
-                raise EvaluationError(f"unknown {what} {getattr(self, what)!r}; there are {', '.join(names)}")
-
-
-@dataclass(slots=True)
-class Flown:
-    """Result of a case."""
-
-    case: Case
-    reached: bool = False
-    ended: str = ""
-    """The planner's final phase, or the reason of the landing."""
-    contacts: int = 0
-    """Contact events (`contact_events`)."""
-    crashed: bool = False
-    landed: bool = False
-    time_s: float = 0.0
-    """Duration from take-off to the goal or the end."""
-    oracle_s: float = 0.0
-    """Duration of the shortest path in the true map, at the same speed and with the same take-off."""
-    path_m: float = 0.0
-    distance_m: float = 0.0
-    """Final distance to the goal."""
-    home_m: float = 0.0
-    """Final distance to the take-off."""
-    exits: list[int] = field(default_factory=lambda: [0, 0, 0])
-    """Number of true exits, of reported ones, and of correct ones."""
-    cruise_m_s: float = 0.0
-    """Median speed in free space."""
-    clearance_p5_m: float = 0.0
-    """5th percentile of the clearance beyond the hull."""
-    clearance_min_m: float = 0.0
-    cpu_ms: float = 0.0
-    """CPU time of planning and mapping per tick."""
-    cpu_worst_ms: float = 0.0
-    near: list[int] = field(default_factory=lambda: [0, 0, 0])
-    """Sectors with an obstacle at 0.3 to 1 m; those 0.3 m too far; those even at two sigmas (`near_counts`)."""
-    depth_age_s: list[float] = field(default_factory=lambda: [math.nan, math.nan])
-    """Age of the newest depth when it is planned with: median and 95th percentile."""
-    off: list[int] = field(default_factory=lambda: [0, 0])
-    """Ticks with metric scale; those of them with an inconsistent pose (`is_beyond`)."""
-    off_m: float = 0.0
-    """Maximum horizontal pose error in ticks with metric scale."""
-    dangers: tuple[str, ...] = ()
-    """Dangers handled by the supervisor."""
-    track_w: list[list[float]] = field(default_factory=list)
-    """``(N, 3)`` true path, for pictures."""
-    attitude: list[list[float]] = field(default_factory=list)
-    """``(N, 5)`` along it: clock [s]; roll, pitch, yaw [rad]; clearance beyond the hull [m]."""
-
-    def record(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
-
-    @classmethod
-    def of_record(cls, record: dict[str, Any]) -> "Flown":
-        """From JSON."""
-        return cls(**{**record, "case": Case(**record["case"]), "dangers": tuple(record["dangers"])})
+    Raises:
+        EvaluationError: If one does not.
+    """
+    known = {"world": SITES, "fault": FAULTS, "behaviour": BEHAVIOURS, "perception": PERCEPTIONS}
+    for what, names in known.items():
+        if getattr(case, what) not in names:
+            raise EvaluationError(f"unknown {what} {getattr(case, what)!r}; there are {', '.join(names)}")
 
 
 def run_flight(case: dict[str, Any], folder: Path) -> dict[str, Any]:
     """What the process of a case does."""
-    flight = Case(**case["flight"])
-    if flight.perception == "udp":
-        from edgeslam_torch.eval.judge.navigation.over_udp import fly_over_udp
-
-        return {"flown": fly_over_udp(flight).record()}
-    return {"flown": fly(flight).record()}
+    return {"flown": fly(Case(**case["flight"])).record()}
 
 
 def fly(case: Case, limits: NavLimits | None = None) -> Flown:
@@ -153,7 +69,7 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
     Raises:
         EvaluationError: If the world, the fault or the behaviour is unknown.
     """
-    case.check()
+    check(case)
     limits, conditions, behaviour = limits or NavLimits(), FAULTS[case.fault], BEHAVIOURS[case.behaviour]
     site, by_slam = named_site(case.world, case.seed), case.perception == "slam"
     wind = np.array([0.0, conditions.wind_m_s, 0.0])

@@ -1,10 +1,9 @@
 """Judged flights in the true world: the shortest path there, top views, and film strips of what the camera saw."""
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 
+from edgeslam_torch.eval.judge.navigation.flown import Flown
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.geometry.rotations import matrix_from_rpy
@@ -16,9 +15,6 @@ from edgeslam_torch.synthetic.house.render import picture
 from edgeslam_torch.synthetic.sites.build import named_site
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
-
-if TYPE_CHECKING:
-    from edgeslam_torch.eval.judge.navigation.flight import Flown
 
 _CELL_M = 0.1
 _PX = 6
@@ -53,7 +49,7 @@ def shortest_m(site: Site, limits: NavLimits) -> float:
     return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()) if np.isfinite(plan.at(start)) else float("inf")
 
 
-def top_view(flown: "Flown") -> np.ndarray:
+def top_view(flown: Flown) -> np.ndarray:
     """World, path flown, start and goal: ``(H, W, 3)`` BGR, x to the right, y up."""
     site = named_site(flown.case.world, flown.case.seed)
     layer = true_layer(site, NavLimits())
@@ -76,7 +72,7 @@ def top_view(flown: "Flown") -> np.ndarray:
     return _captioned(image, words)
 
 
-def film_strip(flown: "Flown") -> np.ndarray | None:
+def film_strip(flown: Flown) -> np.ndarray | None:
     """What the camera saw over the whole flight and before the narrowest moment, ``(H, W, 3)`` BGR; None for a flight
     that ended before it flew."""
     if not flown.attitude or len(flown.attitude) != len(flown.track_w):
@@ -94,7 +90,7 @@ def film_strip(flown: "Flown") -> np.ndarray | None:
     return np.vstack([np.hstack(tiles[:_A_ROW]), np.hstack(tiles[_A_ROW:])])
 
 
-def moments(flown: "Flown") -> list[int]:
+def moments(flown: Flown) -> list[int]:
     """Eight ticks: four spread over the flight, then four that end with the least clearance."""
     attitude: FloatArray = np.array(flown.attitude)
     spread = np.linspace(0, len(attitude) - 1, _A_ROW).round().astype(int)

@@ -9,7 +9,7 @@ import numpy as np
 
 from edgeslam_torch.eval.experiment.conditions import code_state
 from edgeslam_torch.eval.experiment.runner import Local, Task, run_tasks
-from edgeslam_torch.eval.judge.navigation.flight import Case, Flown
+from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.eval.judge.navigation.pictures import film_strip, top_view
 from edgeslam_torch.eval.report.tables import markdown_table
 from edgeslam_torch.files.atomic import write_text
@@ -54,7 +54,7 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
         case: Task(
             out / "flights",
             case.name,
-            "edgeslam_torch.eval.judge.navigation.flight:run_flight",
+            f"edgeslam_torch.eval.judge.navigation.{'over_udp' if case.perception == 'udp' else 'flight'}:run_flight",
             {"commit": commit, "flight": Flown(case).record()["case"]},
         )
         for case in cases

@@ -9,7 +9,8 @@ from edgeslam_torch.cli import main
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.runner import Task
 from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, corridor_ends, right_exits
-from edgeslam_torch.eval.judge.navigation.flight import Case, Flown, contact_events, fly
+from edgeslam_torch.eval.judge.navigation.flight import contact_events, fly
+from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.eval.judge.navigation.perception import WatchedPerception, near_counts
 from edgeslam_torch.eval.judge.navigation.pictures import film_strip, moments, shortest_m, top_view, true_layer
 from edgeslam_torch.eval.judge.navigation.table import judge_flights, markdown

@@ -12,7 +12,7 @@ from edgeslam_torch.models.layout import Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.synthetic.house.rooms import blank_corridor
 from edgeslam_torch.train.recipes import rendered_views
-from edgeslam_torch.train.recipes.mean import mean_of
+from edgeslam_torch.train.recipes.places import mean_of
 from edgeslam_torch.train.views.rendered import stored_views
 
 

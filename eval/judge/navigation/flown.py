@@ -1,0 +1,83 @@
+"""Cases of judged flights and their results."""
+
+import math
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+PERCEPTIONS = ("truth", "slam", "udp")
+"""Source of the planner's states: true pose and depth, or the SLAM; the SLAM over UDP in real time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One case."""
+
+    world: str
+    seed: int
+    fault: str = "none"
+    perception: str = "truth"
+    """One of `PERCEPTIONS`."""
+    behaviour: str = "goto"
+    """A name in `behaviours.BEHAVIOURS`."""
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        name = f"{self.world}_{self.seed}_{self.fault}_{self.perception}"
+        return name if self.behaviour == "goto" else f"{name}_{self.behaviour}"
+
+
+@dataclass(slots=True)
+class Flown:
+    """Result of a case."""
+
+    case: Case
+    reached: bool = False
+    ended: str = ""
+    """The planner's final phase, or the reason of the landing."""
+    contacts: int = 0
+    """Contact events (`contact_events`)."""
+    crashed: bool = False
+    landed: bool = False
+    time_s: float = 0.0
+    """Duration from take-off to the goal or the end."""
+    oracle_s: float = 0.0
+    """Duration of the shortest path in the true map, at the same speed and with the same take-off."""
+    path_m: float = 0.0
+    distance_m: float = 0.0
+    """Final distance to the goal."""
+    home_m: float = 0.0
+    """Final distance to the take-off."""
+    exits: list[int] = field(default_factory=lambda: [0, 0, 0])
+    """Number of true exits, of reported ones, and of correct ones."""
+    cruise_m_s: float = 0.0
+    """Median speed in free space."""
+    clearance_p5_m: float = 0.0
+    """5th percentile of the clearance beyond the hull."""
+    clearance_min_m: float = 0.0
+    cpu_ms: float = 0.0
+    """CPU time of planning and mapping per tick."""
+    cpu_worst_ms: float = 0.0
+    near: list[int] = field(default_factory=lambda: [0, 0, 0])
+    """Sectors with an obstacle at 0.3 to 1 m; those 0.3 m too far; those even at two sigmas (`near_counts`)."""
+    depth_age_s: list[float] = field(default_factory=lambda: [math.nan, math.nan])
+    """Age of the newest depth when it is planned with: median and 95th percentile."""
+    off: list[int] = field(default_factory=lambda: [0, 0])
+    """Ticks with metric scale; those of them with an inconsistent pose (`is_beyond`)."""
+    off_m: float = 0.0
+    """Maximum horizontal pose error in ticks with metric scale."""
+    dangers: tuple[str, ...] = ()
+    """Dangers handled by the supervisor."""
+    track_w: list[list[float]] = field(default_factory=list)
+    """``(N, 3)`` true path, for pictures."""
+    attitude: list[list[float]] = field(default_factory=list)
+    """``(N, 5)`` along it: clock [s]; roll, pitch, yaw [rad]; clearance beyond the hull [m]."""
+
+    def record(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    @classmethod
+    def of_record(cls, record: dict[str, Any]) -> "Flown":
+        """From JSON."""
+        return cls(**{**record, "case": Case(**record["case"]), "dangers": tuple(record["dangers"])})
