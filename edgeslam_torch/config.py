@@ -67,7 +67,7 @@ class DepthConfig:
     """Stage 1: the depth network, once per keyframe."""
 
     weights: str = "default"
-    """``default``, ``broad``, ``none``, a weights file, a described ONNX file, or the name of a downloaded network."""
+    """``default``, ``near``, ``none``, a weights file, a described ONNX file, or the name of a downloaded network."""
     backend: str = "onnxruntime"
     """``onnxruntime`` or ``torch``."""
     device: str = "cpu"

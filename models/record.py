@@ -15,9 +15,9 @@ HEADER_KEY = "edgeslam"
 OTHER_NETWORK = "other"
 """``variant`` of a network other than FastDepth; it comes as an ONNX file, which holds its own graph."""
 DEFAULT_WEIGHTS = Path(__file__).parent / "weights" / "default.safetensors"
-SHIPPED_WEIGHTS = {name: DEFAULT_WEIGHTS.with_name(f"{name}.safetensors") for name in ("default", "broad", "near")}
-"""Weights that come with the package, by name. ``broad`` has better depth in rooms never seen; maps made with it are no
-better, and some are worse. ``near`` is used for obstacle avoidance; the map provides its scale."""
+SHIPPED_WEIGHTS = {name: DEFAULT_WEIGHTS.with_name(f"{name}.safetensors") for name in ("default", "near")}
+"""Weights that come with the package, by name. ``near`` has better shapes in rooms never seen, and worse metres. It is
+used for obstacle avoidance, where the map provides the scale."""
 MAX_INPUT_PX = 2048
 """Maximum height and width; four times the training size."""
 FOCAL_RANGE = (0.05, 20.0)

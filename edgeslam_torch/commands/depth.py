@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--camera", metavar="FILE|PRESET", help="calibration (default: the source's own camera.yaml); metres follow it"
     )
     parser.add_argument(
-        "--depth", default="default", metavar="FILE|NAME", help="weights, broad, an ONNX file or a downloaded network"
+        "--depth", default="default", metavar="FILE|NAME", help="weights, near, an ONNX file or a downloaded network"
     )
     parser.add_argument("--weights", dest="depth", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     parser.add_argument("--backend", choices=("onnxruntime", "torch"), default="onnxruntime", help="what runs it")

@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--depth",
         metavar="FILE|NAME|none",
-        help="depth network: weights, broad, an ONNX file, a downloaded network, or none",
+        help="depth network: weights, near, an ONNX file, a downloaded network, or none",
     )
     add_device(parser)
     parser.add_argument(

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "weights",
         nargs="?",
         type=weights_file,
-        help=".safetensors, .pt or .onnx, or 'default' or 'broad' (default: default)",
+        help=".safetensors, .pt or .onnx, or 'default' or 'near' (default: default)",
     )
 
 

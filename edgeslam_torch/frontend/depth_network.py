@@ -104,7 +104,7 @@ def _open_onnx(
 
 
 def weights_path(name: str) -> Path | None:
-    """File of a depth network: ``default`` (None), ``broad``, the name of a downloaded preset, or a path.
+    """File of a depth network: ``default`` (None), ``near``, the name of a downloaded preset, or a path.
 
     Raises:
         WeightsError: If it is a preset that was not downloaded.

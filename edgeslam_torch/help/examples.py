@@ -42,10 +42,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "edgeslam batch recordings/ -o out --jobs 4",
         "edgeslam batch flights.csv -o out --set orb.features=1500",
     ),
-    "depth": ("edgeslam depth picture.jpg -o depths", "edgeslam depth recording/ --depth broad --sigma -o depths"),
+    "depth": ("edgeslam depth picture.jpg -o depths", "edgeslam depth recording/ --depth near --sigma -o depths"),
     "finetune": (
         "edgeslam finetune recordings/* --validate recordings/last -o mine",
-        "edgeslam finetune runs/* --from-runs --depth broad -o mine",
+        "edgeslam finetune runs/* --from-runs --depth near -o mine",
     ),
     "distil": ("edgeslam distil recordings/* --teacher depth_anything.onnx -o small",),
     "export": (

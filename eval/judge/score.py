@@ -16,6 +16,7 @@ from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, open_run
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.eval.metrics import support
+from edgeslam_torch.eval.metrics.align import rms
 from edgeslam_torch.eval.metrics.live_scale import live_figures
 from edgeslam_torch.eval.metrics.revisit import returns
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
@@ -199,7 +200,7 @@ def _standing_still(run: RunFolder, truth: Truth) -> dict[str, Any]:
     matched = poses.positions[match(poses.stamps_s, run.trajectory.stamps_s)[0]]
     if len(matched) == 0:
         return {}
-    still = np.sqrt(np.mean(np.sum((matched - matched.mean(axis=0)) ** 2, axis=1)))
+    still = rms(matched - matched.mean(axis=0))
     path = np.linalg.norm(np.diff(matched, axis=0), axis=1).sum()
-    percent = _percent(float(still), float(path))
+    percent = _percent(still, float(path))
     return {"ate_m": still, "online_m": still, "ate_percent": percent, "still_m": still, "path_m": path}

@@ -73,3 +73,17 @@ def umeyama(estimate: FloatArray, truth: FloatArray, kind: AlignmentKind | str =
     R = U @ np.diag(sign) @ Vt
     scale = float(np.sum(d * sign) / variance_e) if kind is AlignmentKind.SIM3 else 1.0
     return Alignment(scale, R, mean_t - scale * R @ mean_e, kind, degenerate=bool(d[1] <= 1e-9 * max(d[0], 1e-300)))
+
+
+def rms(vectors: FloatArray) -> float:
+    """Root mean square length of ``(N, 3)``."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
+def misfit(estimate: FloatArray, truth: FloatArray) -> float:
+    """Sim(3) ATE of positions ``(N, 3)`` over what a fixed position would score; infinite when it is not defined."""
+    still = rms(truth - truth.mean(axis=0)) if len(truth) else 0.0
+    try:
+        return rms(umeyama(estimate, truth).points(estimate) - truth) / still if still > 0 else float("inf")
+    except EvaluationError:
+        return float("inf")

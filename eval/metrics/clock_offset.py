@@ -4,18 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
-from edgeslam_torch.eval.metrics.align import umeyama
+from edgeslam_torch.eval.metrics.align import misfit, rms, umeyama
 
 NEAR_S = 10.0
 """Offsets tried when the clocks overlap."""
-
-_MAX_POSES = 200
-_MAX_TRIALS = 2000
-_STEP_S = 0.1
-_MIN_SHARE = 0.4
-"""Share of the estimate that must lie within the truth's time."""
+_MAX_POSES, _MAX_TRIALS, _STEP_S, _FINEST_S = 200, 2000, 0.1, 2e-2
+_MIN_SHARE, _MIN_POSES = 0.4, 10
+"""Share of the estimate, and number of poses, that must lie within the truth's time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +46,8 @@ def _search(truth: Trajectory, estimate: Trajectory, first: float, last: float) 
     trials = np.arange(first, last + step / 2, step)
     best = Offset(0.0, float("inf"), float("inf"))
     while True:
-        for shift in trials:
-            found = _fit(truth, few, float(shift))
-            best = found if found.share < best.share else best
-        if step < 2e-2 or not np.isfinite(best.share):
+        best = min([best, *(_fit(truth, few, float(shift)) for shift in trials)], key=lambda offset: offset.share)
+        if step < _FINEST_S or not np.isfinite(best.share):
             return best
         trials = np.arange(best.shift_s - step, best.shift_s + step, step / 10)
         step /= 10
@@ -62,13 +56,10 @@ def _search(truth: Trajectory, estimate: Trajectory, first: float, last: float) 
 def _fit(truth: Trajectory, estimate: Trajectory, shift: float) -> Offset:
     stamps = estimate.stamps_s + shift
     inside = (stamps >= truth.stamps_s[0]) & (stamps <= truth.stamps_s[-1])
-    if inside.sum() < max(10, _MIN_SHARE * len(stamps)):
+    if inside.sum() < max(_MIN_POSES, _MIN_SHARE * len(stamps)):
         return Offset(shift, float("inf"), float("inf"))
     p = estimate.positions[inside]
     q = np.stack([np.interp(stamps[inside], truth.stamps_s, axis) for axis in truth.positions.T], axis=1)
-    still = float(np.sqrt(np.mean(np.sum((q - q.mean(axis=0)) ** 2, axis=1))))
-    try:
-        error = float(np.sqrt(np.mean(np.sum((umeyama(p, q).points(p) - q) ** 2, axis=1))))
-    except EvaluationError:
-        return Offset(shift, float("inf"), float("inf"))
-    return Offset(shift, error, error / still if still > 0 else float("inf"))
+    share = misfit(p, q)
+    error_m = rms(umeyama(p, q).points(p) - q) if np.isfinite(share) else float("inf")
+    return Offset(shift, error_m, share)

@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, match, possible_pairs
 from edgeslam_torch.eval.inputs.clocks import on_one_clock
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
-from edgeslam_torch.eval.metrics.align import AlignmentKind, umeyama
+from edgeslam_torch.eval.metrics.align import AlignmentKind, misfit
 from edgeslam_torch.eval.metrics.clock_offset import best_offset
 from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore, without_orientation
 from edgeslam_torch.geometry import se3
@@ -130,8 +129,13 @@ def _shape_notes(
         if estimate.oriented or whose == _TRUTH
     ]
     undone += [
-        ("", "the poses run backwards in time against their stamps", truth, _with(estimate, estimate.T_w_c[::-1])),
-        ("", _MIRRORED, truth, _with(estimate, _MIRROR @ estimate.T_w_c)),
+        (
+            "",
+            "the poses run backwards in time against their stamps",
+            truth,
+            replace(estimate, T_w_c=estimate.T_w_c[::-1]),
+        ),
+        ("", _MIRRORED, truth, replace(estimate, T_w_c=_MIRROR @ estimate.T_w_c)),
     ]
     suspects = [_Suspect(whose, mistake, _misfit(t, e, max_dt_s)) for whose, mistake, t, e in undone]
     late = best_offset(truth, estimate)
@@ -198,12 +202,8 @@ def _likeliest(suspects: Sequence[_Suspect], limit: float) -> str | None:
     return (best if len(similar) == 1 else replace(best, whose=_EITHER)).text
 
 
-def _with(trajectory: Trajectory, T_w_c: FloatArray) -> Trajectory:
-    return replace(trajectory, T_w_c=T_w_c)
-
-
 def _inverse(trajectory: Trajectory) -> Trajectory:
-    return _with(trajectory, se3.inverse(trajectory.T_w_c))
+    return replace(trajectory, T_w_c=se3.inverse(trajectory.T_w_c))
 
 
 def _transposed(trajectory: Trajectory) -> Trajectory:
@@ -219,22 +219,13 @@ def _read_w_first(trajectory: Trajectory) -> Trajectory:
 def _turned(trajectory: Trajectory, R: FloatArray) -> Trajectory:
     T = trajectory.T_w_c.copy()
     T[:, :3, :3] = R
-    return _with(trajectory, T)
+    return replace(trajectory, T_w_c=T)
 
 
 def _misfit(truth: Trajectory, estimate: Trajectory, max_dt_s: float) -> float:
-    """Sim(3) ATE of an estimate on the truth's clock, over what a fixed position would score; infinite when too few
-    poses match."""
+    """`misfit` of an estimate on the truth's clock; infinite when too few poses match."""
     i, j = match(truth.stamps_s, estimate.stamps_s, max_dt_s)
-    if len(i) < 3:
-        return float("inf")
-    p, q = estimate.positions[j], truth.positions[i]
-    still = float(np.sqrt(np.mean(np.sum((q - q.mean(axis=0)) ** 2, axis=1))))
-    try:
-        error = umeyama(p, q).points(p) - q
-    except EvaluationError:
-        return float("inf")
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))) / still if still > 0 else float("inf")
+    return misfit(estimate.positions[j], truth.positions[i]) if len(i) >= 3 else float("inf")
 
 
 def _rotation_error(truth: Trajectory, estimate: Trajectory, score: TrajectoryScore) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, Association, associate, nearest
 from edgeslam_torch.eval.inputs.clocks import on_one_clock
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
-from edgeslam_torch.eval.metrics.align import Alignment, AlignmentKind, umeyama
+from edgeslam_torch.eval.metrics.align import Alignment, AlignmentKind, rms, umeyama
 from edgeslam_torch.eval.metrics.clock_offset import any_offset
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray, IntArray
@@ -48,13 +48,8 @@ class Stats:
         """Statistics of errors ``(N,)``; NaN when there are none."""
         if len(errors) == 0:
             return Stats(*[float("nan")] * 5)
-        return Stats(
-            float(np.sqrt(np.mean(errors**2))),
-            float(np.mean(errors)),
-            float(np.median(errors)),
-            float(np.std(errors)),
-            float(np.max(errors)),
-        )
+        rmse = np.sqrt(np.mean(errors**2))
+        return Stats(*map(float, (rmse, np.mean(errors), np.median(errors), np.std(errors), np.max(errors))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +132,8 @@ def score_trajectory(
         raise EvaluationError(f"{estimate.source}: {len(pairs)} pose has ground truth; a trajectory needs at least 2")
     stamps = truth.stamps_s[pairs.truth]
     T_true, T_raw = truth.T_w_c[pairs.truth], estimate.T_w_c[pairs.estimate]
-    fixed_position_m = _fixed_position(T_true)
+    centred = T_true[:, :3, 3] - T_true[:, :3, 3].mean(axis=0)
+    fixed_position_m = rms(centred)
     path_m = float(_path(T_true)[-1])
     jitter = fixed_position_m < _JITTER_M and path_m > 0.5 * len(pairs) * fixed_position_m
     if fixed_position_m < _STILL_M or jitter:
@@ -254,12 +250,6 @@ def _angle_deg(T: FloatArray) -> FloatArray:
 def _path(T: FloatArray) -> FloatArray:
     steps = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def _fixed_position(T: FloatArray) -> float:
-    """RMS distance of positions from their mean."""
-    centred = T[:, :3, 3] - T[:, :3, 3].mean(axis=0)
-    return float(np.sqrt(np.mean(np.sum(centred**2, axis=1))))
 
 
 def _scale(estimate: FloatArray, truth: FloatArray) -> float:

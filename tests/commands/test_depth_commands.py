@@ -214,9 +214,9 @@ def test_weights_list_inspect_convert(
     run("weights", "list")
     listed = capsys.readouterr().out
     assert "mobilenet-nnconv5dw-skipadd-pruned: pruned" in listed
-    assert "broad: mobilenet-nnconv5dw-skipadd\n" in listed
-    run("weights", "inspect", "broad")
-    assert "icsl_corridor" in capsys.readouterr().out
+    assert "near: mobilenet-nnconv5dw-skipadd\n" in listed
+    run("weights", "inspect", "near")
+    assert "hololens_a" in capsys.readouterr().out
     run("weights", "inspect")
     printed = capsys.readouterr().out
     assert "3.96 M parameters" in printed

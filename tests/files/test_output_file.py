@@ -83,7 +83,7 @@ def test_a_folder_is_no_file(tmp_path: Path) -> None:
         "ablation --markdown FILE",
         "view IN --save-rrd FILE",
         "weights convert IN --out FILE",
-        "weights download broad --out FILE",
+        "weights download near --out FILE",
     ],
 )
 def test_commands_leave_what_is_there(command: str, tmp_path: Path, capsys) -> None:

@@ -219,12 +219,12 @@ def test_our_own_weights_are_opened_as_before():
 
 
 def test_weights_that_come_with_the_package_have_names(image):
-    broad, usual = (open_depth(weights_path(name)) for name in ("broad", "default"))
-    assert broad.is_metric
-    assert "icsl_corridor" in broad.metadata.data and "icsl_corridor" not in usual.metadata.data
-    apart = np.log(broad(image, CAMERA).depth_m / usual(image, CAMERA).depth_m)
+    near, usual = (open_depth(weights_path(name)) for name in ("near", "default"))
+    assert near.is_metric
+    assert "hololens_a" in near.metadata.data and "hololens_a" not in usual.metadata.data
+    apart = np.log(near(image, CAMERA).depth_m / usual(image, CAMERA).depth_m)
     assert 1e-3 < np.abs(apart).mean() < 2.0
-    assert weights_file("broad") == weights_path("broad")
+    assert weights_file("near") == weights_path("near")
     assert weights_file("a/b.safetensors") == Path("a/b.safetensors")
 
 

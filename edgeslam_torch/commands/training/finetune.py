@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="weights",
         type=weights_file,
         metavar="FILE|NAME",
-        help="weights to start from: a file, 'default' or 'broad' (default: default)",
+        help="weights to start from: a file, 'default' or 'near' (default: default)",
     )
     parser.add_argument("--weights", type=weights_file, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     parser.add_argument("--ignore-depth", action="store_true", help="ignore depth maps of recordings")
