@@ -133,6 +133,7 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
             bouts.append(speed.time(measure))
             before, after = (bout["reference"] for bout in bouts[-2:])
             run["reference"] = {key: (before[key] + after[key]) / 2 for key in before}  # while the run went on
+            run["figures"].pop("finish_ms", None)  # of the rows alone
             record["runs"].append(run)
             record |= probes.gather(bouts)
             _save(record, out / "bench.json")
