@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.errors import EdgeSlamError, SourceError
+from edgeslam_torch.files.imu_files import READINGS
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera_file import camera_keys
 from edgeslam_torch.imu import ImuModel, ImuReadings
@@ -17,7 +18,7 @@ from edgeslam_torch.readers.imu.table import read_readings
 
 NONE = "none"
 """Given in place of a file: no IMU is used."""
-READINGS, EUROC, KINECT = "imu.csv", Path("imu0", "data.csv"), "accelerometer.txt"
+EUROC, KINECT = Path("imu0", "data.csv"), "accelerometer.txt"
 _T_KINECT_CAM = np.diag([-1.0, -1.0, 1.0, 1.0])
 """The Kinect's accelerometer has x left, y up, z forward (https://cvg.cit.tum.de/data/datasets/rgbd-dataset)."""
 _MISSING_S = 0.5

@@ -9,10 +9,12 @@ import numpy as np
 
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.imu_files import write_imu
 from edgeslam_torch.files.plain import subfolder, write_image
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
+from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.synthetic.flights.degrade import CLEAN, CameraFaults, degraded
 from edgeslam_torch.synthetic.flights.flight import Flight
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryLog
@@ -31,6 +33,7 @@ def write_flight(
     camera: Camera,
     *,
     telemetry: TelemetryLog | None = None,
+    imu: tuple[ImuReadings, ImuModel] | None = None,
     faults: CameraFaults = CLEAN,
     seed: int = 0,
     depth_every: int = 1,
@@ -46,6 +49,7 @@ def write_flight(
         flight: Where from.
         camera: Intrinsics.
         telemetry: Written as ``telemetry.csv``.
+        imu: Written as ``imu.csv`` and ``imu.yaml``.
         faults: What the camera does to the images.
         seed: Of the image noise; each frame has its own stream.
         depth_every: Write the exact depth of every n-th frame (0 for none).
@@ -68,6 +72,8 @@ def write_flight(
         _write_text(folder / "groundtruth.txt", _groundtruth_lines(flight.stamps_s, T_w_c))
         if telemetry is not None:
             telemetry.write(folder / "telemetry.csv")
+        if imu is not None:
+            write_imu(folder, *imu)
 
         def draw(i: int) -> None:
             view = render(world, camera, T_w_c[i])

@@ -2,7 +2,9 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.files.imu_files import write_imu
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.readers.imu.find import Given, find_imu
 
 T_IMU_CAM = se3.exp(np.array([0.1, 0.2, -0.1, 0.3, -0.8, 1.2]))
@@ -139,3 +141,16 @@ def test_without_an_imu_there_is_no_warning(tmp_path):
     assert found(tmp_path) == (None, None, [])
     with pytest.raises(EdgeSlamError, match="readings"):
         found(tmp_path, Given(model=tmp_path / "imu.yaml"))
+
+
+def test_written_files_give_the_same_readings_and_model(tmp_path, rng):
+    stamps_s = BEGIN_S + 0.005 * np.arange(400)
+    force = rng.standard_normal((400, 3)) + [0, 0, 9.81]
+    readings = ImuReadings(stamps_s, rng.standard_normal((400, 3)), force)
+    wanted = ImuModel(**NOISE, rate_hz=200.0, T_imu_cam=T_IMU_CAM, time_offset_s=0.01)
+    write_imu(tmp_path, readings, wanted)
+    model, read, said = found(tmp_path)
+    assert not said and read.stamps_s == pytest.approx(stamps_s, abs=1e-6)
+    assert read.angular_rate_rad_s.tolist() == readings.angular_rate_rad_s.tolist()
+    assert read.acceleration_m_s2.tolist() == force.tolist()
+    assert (model.T_imu_cam == T_IMU_CAM).all() and model.time_offset_s == 0.01
