@@ -11,12 +11,13 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import find_recordings
 from edgeslam_torch.eval.judge import sources
 from edgeslam_torch.eval.judge.flights import NONE
+from edgeslam_torch.eval.judge.simulated_imu import IMU_KINDS
 from edgeslam_torch.eval.judge.simulated_telemetry import KINDS
 from edgeslam_torch.readers.source import Recording
 from edgeslam_torch.synthetic.flights.courses import COURSES
 
-SETS = ("base", "variants", "flights", "telemetry", "all")
-"""Recordings as they are, their variants, simulations, telemetry along recordings, everything."""
+SETS = ("base", "variants", "flights", "telemetry", "imu", "all")
+"""Recordings as they are, their variants, simulated flights, simulated telemetry, a simulated IMU, everything."""
 CASES: dict[str, Any] = tomllib.loads(Path(__file__).with_name("cases.toml").read_text(encoding="utf-8"))
 MIN_FRAMES = 30
 """Shorter recordings, and variants that leave fewer, are not judged."""
@@ -72,7 +73,8 @@ class Cell:
     """One run."""
 
     name: str
-    """``RECORDING``, ``RECORDING/VARIANT``, ``flight/COURSE``, ``none/KIND`` or ``telemetry/KIND/RECORDING``."""
+    """``RECORDING``, ``RECORDING/VARIANT``, ``flight/COURSE``, ``none/KIND``, ``telemetry/KIND/RECORDING`` or
+    ``imu/KIND/RECORDING``, ``imu/KIND/COURSE``."""
     seed: int
     """Seed of the system, of a simulation's world and of simulated telemetry."""
     folder: str = ""
@@ -85,6 +87,8 @@ class Cell:
     """Source without usable images: a name in `flights.NONE`."""
     telemetry: str = ""
     """Simulated telemetry: a name in `simulated_telemetry.KINDS`."""
+    imu: str = ""
+    """Simulated IMU: a name in `simulated_imu.IMU_KINDS`."""
 
     @property
     def base(self) -> str:
@@ -128,6 +132,14 @@ def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequen
         made += [Cell(f"{name}/{variant}" if variant else name, 0, str(folder), variant) for variant in wanted]
         if which in ("telemetry", "all") and name in CASES["telemetry"]:
             made += [Cell(f"telemetry/{kind}/{name}", 0, str(folder), telemetry=kind) for kind in KINDS]
+        if which in ("imu", "all") and name in CASES["imu"]["recordings"]:
+            made += [Cell(f"imu/{kind}/{name}", 0, str(folder), imu=kind) for kind in IMU_KINDS]
+    if which in ("imu", "all"):
+        made += [
+            Cell(f"imu/{kind}/{course}", 0, course=course, imu=kind)
+            for course in CASES["imu"]["courses"]
+            for kind in CASES["imu"]["kinds"]
+        ]
     if which in ("flights", "all"):
         made += [Cell(f"flight/{course}", 0, course=course) for course in COURSES]
         for variant, courses in CASES["courses"].items():

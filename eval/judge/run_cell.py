@@ -15,6 +15,7 @@ from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.eval.judge import flights, second_flight, sources
 from edgeslam_torch.eval.judge.cells import BACKWARDS, CASES, CUT, KIDNAP, SECOND_FLIGHT, VARIANTS, Cell
 from edgeslam_torch.eval.judge.score import Truth, score
+from edgeslam_torch.eval.judge.simulated_imu import IMU_KINDS
 from edgeslam_torch.eval.judge.simulated_telemetry import KINDS, Drawn
 from edgeslam_torch.files.config_file import load_config
 from edgeslam_torch.readers.layouts import read_sequence
@@ -78,7 +79,7 @@ def opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tru
     if cell.course:
         place = flights.flight_folder(flights_root, cell.course, cell.seed, int(cell.variant == SECOND_FLIGHT))
         world = COURSES[cell.course].world
-        return _recording(place), Truth(
+        return _with_imu(cell, _recording(place), place), Truth(
             place, surfaces=lambda p_w: world(np.random.default_rng(cell.seed)).distance_to_surface(p_w)
         )
     place = Path(cell.folder)
@@ -90,9 +91,19 @@ def opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tru
     dataset = open_dataset(place)
     if cell.telemetry:
         drawn = Drawn(dataset.truth, dataset.frame_stamps_s, cell.seed)
-        return replace(source, telemetry=KINDS[cell.telemetry](drawn)), Truth(place)
+        return replace(source, telemetry=KINDS[cell.telemetry](drawn), imu=None, imu_readings=None), Truth(place)
+    source = _with_imu(cell, source, place)
     truth = Truth(place, place if dataset.depth is not None else None)
     return VARIANTS[cell.variant].applied_to(source, cell.seed) if cell.variant else source, truth
+
+
+def _with_imu(cell: Cell, source: Recording, place: Path) -> Recording:
+    """The source with the cell's simulated IMU in place of all its sensors."""
+    if not cell.imu:
+        return source
+    dataset = open_dataset(place)
+    model, readings = IMU_KINDS[cell.imu](Drawn(dataset.truth, dataset.frame_stamps_s, cell.seed))
+    return replace(source, telemetry=[], imu=model, imu_readings=readings)
 
 
 def _first_flight(cell: Cell, flights_root: Path) -> tuple[Recording, Truth]:

@@ -1,5 +1,6 @@
 """Variants of a recording as sources: another rate, size, start, focal length or order; no file is copied."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, islice
@@ -44,7 +45,7 @@ def _resized(image: NDArray[np.uint8], size: Size | None) -> NDArray[np.uint8]:
 def part(recording: Recording, first: int = 0, step: int = 1, count: int | None = None) -> Recording:
     """No more than ``count`` of every ``step``-th frame from number ``first`` on, numbered anew, with their stamps.
 
-    Telemetry of a later start begins one second before it.
+    Telemetry and IMU readings of a later start begin one second before it.
     """
     if (first, step, count) == (0, 1, None):
         return recording
@@ -58,10 +59,15 @@ def part(recording: Recording, first: int = 0, step: int = 1, count: int | None 
         return (ChangedFrame(frame, i, frame.stamp_s) for i, frame in enumerate(chosen))
 
     changed = replace(recording, decode=decode, length=count if length is None else length)
-    start = next(changed.decode([]), None) if first and recording.telemetry else None
+    start = next(changed.decode([]), None) if first and (recording.telemetry or recording.imu_readings) else None
     if start is None:
         return changed
-    return replace(changed, telemetry=[s for s in recording.telemetry if s.stamp_s >= start.stamp_s - 1.0])
+    begin_s, felt = start.stamp_s - 1.0, recording.imu_readings
+    return replace(
+        changed,
+        telemetry=[s for s in recording.telemetry if s.stamp_s >= begin_s],
+        imu_readings=None if felt is None else felt.between(begin_s, math.inf),
+    )
 
 
 def smaller(recording: Recording, factor: int) -> Recording:
@@ -93,7 +99,7 @@ def perturbed(recording: Recording, draw: int, sigma_px: float) -> Recording:
 
 
 def reordered(recording: Recording, images: Sequence[ImageEntry], order: IntArray, stamps_s: FloatArray) -> Recording:
-    """Some of a recording's images in another order, without telemetry; its ground truth must be reordered likewise.
+    """Some of a recording's images in another order, by the camera alone; its ground truth is reordered likewise.
 
     Args:
         recording: As it was taken.
@@ -107,7 +113,9 @@ def reordered(recording: Recording, images: Sequence[ImageEntry], order: IntArra
     def decode(problems: list[Problem]) -> Iterator[Frame]:
         return frames_of(played, size, problems)
 
-    return replace(recording, decode=decode, length=len(played), telemetry=[], groundtruth=None)
+    return replace(
+        recording, decode=decode, length=len(played), telemetry=[], imu=None, imu_readings=None, groundtruth=None
+    )
 
 
 def backwards(stamps_s: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -122,13 +130,13 @@ def cut(stamps_s: FloatArray, segments: Sequence[Sequence[int]]) -> tuple[IntArr
 
 
 def followed_by(first: Recording, second: Recording, count: int, rate_hz: float) -> Recording:
-    """A film with a cut: ``count`` frames of one recording, then of another with the same camera, without telemetry."""
+    """A film with a cut: ``count`` frames of one recording, then of another with the same camera, by it alone."""
 
     def decode(problems: list[Problem]) -> Iterator[Frame]:
         both = chain.from_iterable(islice(one.decode(problems), count) for one in (first, second))
         return (ChangedFrame(frame, i, i / rate_hz) for i, frame in enumerate(both))
 
-    return replace(first, decode=decode, length=2 * count, telemetry=[], groundtruth=None)
+    return replace(first, decode=decode, length=2 * count, telemetry=[], imu=None, imu_readings=None, groundtruth=None)
 
 
 def made_of(images: Callable[[int], NDArray[np.uint8]], count: int, camera: Camera, rate_hz: float) -> Recording:
