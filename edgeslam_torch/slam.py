@@ -13,10 +13,10 @@ from typing import Any, Self
 import cv2
 import numpy as np
 
-from edgeslam_torch.atlas.atlas import Atlas, Join
-from edgeslam_torch.atlas.loops import Closure
+from edgeslam_torch.atlas.atlas import Atlas, MapChange
 from edgeslam_torch.atlas.prior_map import PriorMaps
 from edgeslam_torch.atlas.saved import SavedAtlas, Unit, pack, unpack
+from edgeslam_torch.atlas.submap_graph import SubmapGraph
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.estimation.motion import MotionFusion
@@ -54,7 +54,7 @@ from edgeslam_torch.states.tracking import Tracking
 from edgeslam_torch.tracking.lazy_view import LazyView
 from edgeslam_torch.tracking.motion_model import MotionModel
 from edgeslam_torch.tracking.self_calibration import calibration_warning
-from edgeslam_torch.tracking.tracker import Tracker, View, make_view
+from edgeslam_torch.tracking.tracker import Tracker, make_view
 from edgeslam_torch.types import (
     FloatArray,
     Frame,
@@ -133,6 +133,9 @@ class EdgeSlam:
             executor = ThreadPoolExecutor(1, thread_name_prefix="mapping")
         lm = lm_config(config.window)
         mapper = Mapper(self.map, camera, config, lm, self.edges)
+        fusion = MotionFusion(config.fusion, self._T_b_c, camera.focal_sigma)
+        fusion.refined_poses = self.log.poses
+        graph = SubmapGraph(self.map, self.log, fusion.scale, fusion.scale_around, fusion.scale_along)
         self._system = System(
             camera,
             config,
@@ -141,29 +144,19 @@ class EdgeSlam:
             Tracker(self.map, camera, config.orb, config.tracking),
             self.edges,
             MappingPipeline(mapper, self.edges, camera, self.depth, executor),
-            MotionFusion(config.fusion, self._T_b_c, camera.focal_sigma),
+            fusion,
             MotionModel(se3.inverse(first_pose(np.full(3, np.nan), self._T_b_c))),
+            graph,
         )
-        self._system.fusion.refined_poses = self.log.poses
         if realtime:
             self.events["keyframes_skipped"] = 0
         self._finished = False
         self._present = Present()
         """Immutable state for `pose_now` and `health`, replaced atomically."""
         self._machine = Machine()
-        atlas = Atlas(
-            self._system.tracker,
-            self.edges,
-            self.log,
-            lm,
-            config.mapping.loop_closure,
-            self._system.fusion.scale_around,
-            self._system.fusion.scale_along,
-            self._system.submap_uncertainty.start_sigma,
-            self._system.fusion.orientation.facing_along,
-        )
+        atlas = Atlas(self._system.tracker, self.edges, graph, lm, config.mapping.loop_closure)
         self._joining = MapMerging(self._system, atlas)
-        self._earlier: PriorMaps | None = None
+        self._earlier = PriorMaps()
         self._tracking = Tracking(self._system)
         self._starting = Starting(self._system, self._tracking, atlas, lm, realtime)
         self._lost = Lost(self._system, self._tracking, self._starting)
@@ -218,8 +211,7 @@ class EdgeSlam:
         relative = replace(estimate, value=estimate.value / published.scale, sigma=estimate.sigma / published.scale)
         units = {piece: Unit(np.eye(4), known) for piece, known in self._joining.atlas.known_scale.items()}
         units[shown] = Unit(sim3.compose(published.scale, published.R, published.offset), relative)
-        flights = (*(() if self._earlier is None else self._earlier.flights), flight)
-        return pack(self.map, self.edges, self.camera, flights, units)
+        return pack(self.map, self.edges, self.camera, (*self._earlier.flights, flight), units)
 
     def prepare(self, frame: Frame) -> LazyView:
         """Feature extraction that does not depend on earlier frames; may run on another thread.
@@ -229,13 +221,10 @@ class EdgeSlam:
             TypeError, ValueError: As `check_frame`.
         """
         check_frame(frame)
-        seen = LazyView(frame, self.camera, self._extract)
+        seen = LazyView(frame, self.camera, lambda grey: make_view(self._orb(grey), self.config.orb.scale_factor))
         if self._tracking.needs_features:
             _ = seen.view
         return seen
-
-    def _extract(self, grey: np.ndarray) -> View:
-        return make_view(self._orb(grey), self.config.orb.scale_factor)
 
     def step(self, frame: Frame, readings: Sequence[Reading] = (), prepared: LazyView | None = None) -> SlamOutput:
         """Pose of one frame; frames must come in the order of their stamps.
@@ -268,20 +257,14 @@ class EdgeSlam:
             system.fusion.add_telemetry(telemetry)
             system.has_telemetry = system.has_telemetry or len(telemetry) > 0
         if not self.log.records:
-            system.fusion.orientation.began_s = frame.stamp_s
-        if not self.log.records and telemetry:  # attitude of the first camera, so that the world's z is up
-            system.motion.T_c_w = se3.inverse(first_pose(telemetry[-1].rpy_rad, self._T_b_c))
-            upright = bool(np.isfinite(telemetry[-1].rpy_rad).all())
-            system.published = replace(system.published, upright=upright)
-            # A loaded map keeps its axes.
-            system.fusion.orientation.began_upright = self._earlier is None and upright
+            system.begin_flight(frame.stamp_s, telemetry, self._T_b_c, keeps_axes=self._earlier.pieces > 0)
         step = self._step(frame, seen)
-        if self._earlier is not None:
+        if self._earlier.pieces:
             self._joining.enter(self.map.piece_of(step.keyframe.id))
         self._machine.apply(step.event, frame.stamp_s)
         system.motion.stamp_s = frame.stamp_s
-        doubts = system.submap_sigma, system.drift_sigma
-        self._present = system.fusion.present(frame.stamp_s, str(self.state), system.published, *doubts)
+        sigmas = system.position_sigmas(self.map.piece_of(step.keyframe.id))
+        self._present = system.fusion.present(frame.stamp_s, str(self.state), system.published, *sigmas)
         return self._output(frame, step, joined)
 
     def pose_now(self, stamp_s: float, readings: Sequence[Reading] = ()) -> PoseNow | None:
@@ -319,7 +302,7 @@ class EdgeSlam:
         """After the last frame: refine the whole map, measure the remaining edges and finalise the scale."""
         self._system.collect(wait=True)
         self._joining.finish()
-        if self._earlier is not None:
+        if self._earlier.pieces:
             self._joining.enter(self.support().largest())
         self._finished = True
         result = last_refinement(
@@ -338,7 +321,7 @@ class EdgeSlam:
         """Determine the vertical: from the drone's attitude, with which the world is aligned already; else from
         accelerometer and edges, after which the world is rotated, unless its axes are those of a loaded map."""
         system = self._system
-        if system.published.upright and (self._earlier is None or system.fusion.orientation.began_upright):
+        if system.published.upright and (not self._earlier.pieces or system.fusion.orientation.began_upright):
             self.up = Up(np.array([0.0, 0.0, 1.0]), self.config.fusion.alignment_sigma_rad, "telemetry")
             return
         shown = self._shown_keyframes()
@@ -447,18 +430,16 @@ class EdgeSlam:
         """Submaps that the frames belong to; the transforms between them are unknown."""
         return self.log.pieces()
 
-    def joins(self) -> list[Join]:
+    def joins(self) -> list[MapChange]:
         """Merged submaps with the evidence, in temporal order."""
-        return list(self._joining.atlas.joins)
+        return [change for change in self._joining.atlas.changes if change.kind == "joined"]
 
-    def closures(self) -> list[Closure]:
+    def closures(self) -> list[MapChange]:
         """Loops closed inside a submap, with their statistics, in temporal order."""
-        return list(self._joining.atlas.closures)
+        return [change for change in self._joining.atlas.changes if change.kind == "loops_closed"]
 
     def earlier_flights(self) -> dict[str, Any] | None:
         """Statistics of the loaded atlas; None without one."""
-        if self._earlier is None:
-            return None
         return self._earlier.summary(self.support(), self.map)
 
     def telemetry_statistics(self) -> dict[str, float]:
@@ -472,26 +453,16 @@ class EdgeSlam:
     def warnings(self) -> list[str]:
         """Limitations of the results, as sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
-        map_mismatch = None if self._earlier is None else self._earlier.warning(self.support())
         upright = self._system.published.upright
         warnings = (
-            self._machine.warning(),
             depth,
-            self._warning_of_pieces(),
-            map_mismatch,
+            self.log.warning(),
+            self._earlier.warning(self.support()),
             self._repeats.warning(self._system.fusion.flight.track.hovers),
             self._calibration_warning,
             None if upright or self.up is not None else self._system.fusion.orientation.leaning(),
         )
         return [warning for warning in warnings if warning is not None] + self._system.fusion.warnings()
-
-    def _warning_of_pieces(self) -> str | None:
-        pieces = [p for p in self.pieces() if p.supported > 0]
-        if len(pieces) < 2:
-            return None
-        began_s = min(p.first_s for p in self.pieces())
-        spans = ", ".join(f"{p.number} ({p.first_s - began_s:.1f} to {p.last_s - began_s:.1f} s)" for p in pieces)
-        return f"the map is in {len(pieces)} pieces that were never joined, {spans}: poses across them do not relate"
 
     # -- helpers -----------------------------------------------------------------------------------------------
 
@@ -500,16 +471,15 @@ class EdgeSlam:
         assert health is not None
         T_c_w = system.motion.T_c_w
         piece = self.map.piece_of(step.keyframe.id)
-        if self._earlier is not None:
-            found = self._earlier.see(frame.stamp_s, piece, step.status.supported)
-            joined = "; ".join(filter(None, (joined, found)))
+        found = self._earlier.see(frame.stamp_s, piece, step.status.supported)
+        words = "; ".join(filter(None, (joined, found, step.reason)))
         self.log.append(frame.index, frame.stamp_s, step.keyframe.id, T_c_w, step.status.supported, step.T_c_before)
         return SlamOutput(
             index=frame.index,
             stamp_s=frame.stamp_s,
             T_w_c=system.published.pose(se3.inverse(T_c_w)),
             status=step.status,
-            reason="; ".join(filter(None, (joined, step.reason))) or (REPEATED if system.shows_nothing_new else ""),
+            reason=words or (REPEATED if system.shows_nothing_new else ""),
             matches=0 if track is None else track.matches,
             inliers=0 if track is None else track.inliers,
             parallax_rad=step.parallax_rad,

@@ -1,6 +1,7 @@
-"""Merging of submaps (pieces of map) and loop closure.
+"""Submaps: how they lie relative to each other, recognition of places, merging, loop closure, and storage.
 
-`place_recognition.py` proposes keyframes, `links.py` verifies that a keyframe shows another submap and estimates the
-similarity between the two, `map_merging.py` moves the smaller submap and merges both, and `atlas.py` decides: two links
-must agree.
+`submap_graph.py` says what sensors and the map itself know of the relation of two places, with a covariance;
+`place_recognition.py` proposes keyframes that may show one place; `links.py` verifies that by images. `atlas.py`
+decides: two links that agree with each other and with the graph merge two submaps or close a loop; `relaxation.py`
+then moves the map. `saved.py` and `atlas_file.py` store it.
 """

@@ -4,34 +4,17 @@ A false merge corrupts the whole map; a missed one leaves two submaps. Hence a m
 common keyframe that agree about the similarity.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.atlas.links import Link, link, on_one_plane
-from edgeslam_torch.atlas.loops import (
-    LOOP_SHARE,
-    Bridge,
-    Closure,
-    as_it_is,
-    bridge,
-    expected_drift,
-    far_keyframes,
-    is_near_prediction,
-    is_plausible,
-    is_within_reach,
-    spread,
-)
-from edgeslam_torch.atlas.map_merging import look_around, merge_submaps, move_piece, share_anchors
+from edgeslam_torch.atlas.links import LINK_LOG, Link, link, on_one_plane
 from edgeslam_torch.atlas.place_recognition import MIN_VOTES, revisit_candidates
-from edgeslam_torch.atlas.saved import BEFORE_S
-from edgeslam_torch.atlas.submap_heading import Facing, Turned, angle_between, is_turned, turn_about
-from edgeslam_torch.atlas.submap_scale import AGAIN_S as UNIT_AGAIN_S
-from edgeslam_torch.atlas.submap_scale import Rescaled, about, is_other
-from edgeslam_torch.geometry import sim3
+from edgeslam_torch.atlas.relaxation import look_around, merge_submaps, move, relaxed, share_anchors
+from edgeslam_torch.atlas.submap_graph import MIN_SHARED, PLACE_LOG, SubmapGraph
+from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
-from edgeslam_torch.map.trajectory import TrajectoryLog
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.tracker import Tracker
@@ -44,6 +27,11 @@ MIN_BASELINE = 0.02
 """Distance between the keyframes of two links, relative to their depth, from which on they are independent."""
 MIN_TURN_RAD = np.deg2rad(3.0)
 """Rotation between them from which on they are independent."""
+MIN_AWAY_S = 5.0
+"""Minimum age of a keyframe for a loop; younger ones are still in the window."""
+LOOP_SHARE = 0.2
+"""Share of the anchors in view that must be matched at the other end. Repetitive wallpaper reaches 0.16 at a wrong
+place; a true revisit 0.2 to 0.4."""
 LOOP_SEARCH_S = 1.0
 """Time between two searches for loops; each costs half a frame."""
 LOOP_SEARCH_RAD = np.deg2rad(20.0)
@@ -51,46 +39,35 @@ LOOP_SEARCH_RAD = np.deg2rad(20.0)
 LOOP_VOTES = 20
 """Votes for a candidate to be matched: a tenth of `MOST_VOTERS`. True revisits get 30 and more of 200, repetitive
 wallpaper 22."""
+WITHIN_PX = 5.0
+"""Offset up to which tracking and the window find the old anchors without a loop (`mapping/local_loop_closure.py`)."""
 AGAIN_S = 0.1
 """Time between two keyframes of a renewed search, which takes a third of a core."""
+SCALE_AGAIN_S = 2.0
+"""Time between two comparisons of the scales of the camera's submap and the first one."""
 WITNESSES = 4
 """Covisible keyframes that are matched to confirm a new link."""
 
 
 @dataclass(frozen=True, slots=True)
-class Join:
-    """A merge of two submaps."""
+class MapChange:
+    """A merge of two submaps, a closed loop, or a correction of a submap's scale."""
 
+    kind: str
+    """Key in the summary's events: ``joined``, ``loops_closed``, ``rescaled``."""
     stamp_s: float
     """Stamp of the confirming keyframe."""
-    piece: int
-    """Number of the merged submap."""
-    absorbed: int
-    """Number that no longer exists."""
-    moved: int
-    """Submap that was transformed to the other."""
-    S: FloatArray
-    """``(4, 4)`` similarity that transformed it."""
-    sigma_log: float
-    """Standard deviation of its log scale: measurement, difference between links, and bending of the maps."""
-    links: int
-    """Number of keyframes that agreed."""
-    matches: int
-    """Number of their matched keypoints."""
-    scale_change: dict[int, float] = field(default_factory=dict)
-    """Change of scale at each keyframe by the subsequent correction of the older submap's drift."""
+    text: str
+    """For `status.csv` and the summary."""
+    scale_change: dict[int, float]
+    """Change of scale at each keyframe that was moved, including removed ones."""
 
-    def growth(self, piece: int, keyframe_id: int) -> float:
-        """Change of scale at a keyframe of a submap."""
-        return (sim3.scale_of(self.S) if self.moved == piece else 1.0) * self.scale_change.get(keyframe_id, 1.0)
+    def growth(self, keyframe_id: int) -> float:
+        """Change of scale at a keyframe."""
+        return self.scale_change.get(keyframe_id, 1.0)
 
     def __str__(self) -> str:
-        """For `status.csv` and the summary."""
-        scale = sim3.scale_of(self.S)
-        return (
-            f"piece {self.absorbed} joined piece {self.piece}: {self.links} keyframes agree, {self.matches} keypoints, "
-            f"piece {self.moved} scaled by {scale:.3f} (sigma {100 * self.sigma_log:.1f} %)"
-        )
+        return self.text
 
 
 class Atlas:
@@ -99,45 +76,26 @@ class Atlas:
     Args:
         tracker: Contains the map.
         edges: Measured edges, which move with their keyframes.
-        log: Frames, which move with their keyframes.
+        graph: What sensors and the map itself say about the relation of two places.
         lm: Settings of the refinement.
         closing: Whether to close loops inside a submap.
-        metres: Metres per map unit around the stamp of an earlier frame, by sensors other than the camera.
-        metres_along: The same for some frames, by their stamps ``(F,)`` and poses ``(F, 4, 4)``.
-        start_sigma: Standard deviation per axis [map units] of the start of a submap, by its number, if the drone's
-            sensors predicted it; infinite otherwise.
-        facing_along: Orientation of the map of some frames, by their stamps ``(F,)`` and poses ``(F, 4, 4)``, in the
-            drone's world, by its attitude.
     """
 
     def __init__(
-        self,
-        tracker: Tracker,
-        edges: EdgeMap,
-        log: TrajectoryLog,
-        lm: LmConfig,
-        closing: bool = False,
-        metres: Callable[[float], ScaleEstimate | None] = lambda _: None,
-        metres_along: Callable[[FloatArray, FloatArray], ScaleEstimate | None] = lambda *_: None,
-        start_sigma: Callable[[int], float] = lambda _: np.inf,
-        facing_along: Callable[[FloatArray, FloatArray], Facing | None] = lambda *_: None,
+        self, tracker: Tracker, edges: EdgeMap, graph: SubmapGraph, lm: LmConfig, closing: bool = False
     ) -> None:
         self.tracker = tracker
         self.map = tracker.map
         self.edges = edges
-        self.log = log
+        self.graph = graph
         self.lm = lm
         self.closing = closing
-        self.metres = metres
-        self.metres_along = metres_along
-        self.start_sigma = start_sigma
-        self.facing_along = facing_along
-        self.joins: list[Join] = []
-        self.closures: list[Closure] = []
+        self.changes: list[MapChange] = []
+        """In temporal order."""
         self.known_scale: dict[int, ScaleEstimate] = {}
         """Metres per map unit of submaps of earlier flights, by their number."""
         self._links: list[Link] = []
-        """Links between submaps that are not merged yet."""
+        """Links that no other one has confirmed yet."""
         self._searched = -1
         """Newest keyframe that was searched."""
         self._again: list[int] = []
@@ -146,8 +104,8 @@ class Atlas:
         """Stamp of the last renewed search."""
         self._loop_searched: Keyframe | None = None
         """Newest keyframe that was searched for a loop."""
-        self._aligned_s = -np.inf
-        """Stamp of the last comparison of the camera's submap with the flight's first one."""
+        self._scale_s = -np.inf
+        """Stamp of the last comparison of scales."""
 
     def others(self, piece: int) -> list[Keyframe]:
         """Keyframes of other submaps that have anchors."""
@@ -163,7 +121,7 @@ class Atlas:
         """Whether every keyframe was searched and none is waiting for a renewed search."""
         return max(self.map.keyframes, default=-1) <= self._searched and not self._again
 
-    def update(self, stamp_s: float = np.inf) -> Join | Closure | None:
+    def update(self, stamp_s: float = np.inf) -> MapChange | None:
         """Search the keyframes that are new since the last call, and one of those that wait for a renewed search.
 
         The caller must own the map.
@@ -198,7 +156,31 @@ class Atlas:
         self._searched = -1
         self._loop_searched = None
 
-    def _search(self, keyframe: Keyframe) -> Join | Closure | None:
+    def correct_scale(self, stamp_s: float, now: ScaleEstimate | None = None) -> MapChange | None:
+        """Scale the camera's submap to the flight's first one if the drone's sensors show a difference: it began with
+        predicted depths, which may be wrong by half. The caller must own the map.
+
+        Args:
+            stamp_s: Present time.
+            now: Present metres per map unit, if reliable.
+        """
+        if not self.graph.log.records or stamp_s - self._scale_s < SCALE_AGAIN_S:
+            return None
+        piece = self.graph.present
+        if piece == self.graph.first or piece in self.known_scale:
+            return None
+        self._scale_s = stamp_s
+        ratio = self.graph.wrong_scale(now)
+        if ratio is None:
+            return None
+        mine = self._keyframes_of(piece)
+        about = sim3.compose(ratio, np.eye(3), (1.0 - ratio) * self.map.keyframes[min(mine)].centre_w)
+        text = f"piece {piece} scaled by {ratio:.3f} to the previous metres"
+        return self._changed("rescaled", stamp_s, text, self._moved(dict.fromkeys(mine, about)))
+
+    # -- search ------------------------------------------------------------------------------------------------
+
+    def _search(self, keyframe: Keyframe) -> MapChange | None:
         if not _is_mapped(keyframe):
             return None
         others = self.others(self.map.piece_of(keyframe.id))
@@ -227,91 +209,30 @@ class Atlas:
         return revisit_candidates(self.map, keyframe.words, among, most, min_votes) if among else []
 
     def _link(self, keyframe: Keyframe, other: Keyframe) -> Link | None:
-        """A verified link; within a submap, similar places too far apart are rejected."""
-        if self.map.piece_of(keyframe.id) != self.map.piece_of(other.id):
-            found = link(self.tracker, keyframe, other, scale_between=self._scale_between)
-            return found if found is not None and self._may_lie_so(found) else None
-        found = link(self.tracker, keyframe, other, LOOP_SHARE, scale_between=as_it_is)
-        if found is None or (not found.by_images and self._is_flat(found)):
-            return None
-        expected = expected_drift(*(self.metres(k.stamp_s) for k in (keyframe, other)))
-        metric = self._scale_of(self.map.piece_of(keyframe.id)) is not None
-        return found if is_plausible(self.map, found, expected, metric) else None
+        """A verified link that agrees with what is known of the relation of both ends.
 
-    def _may_lie_so(self, one: Link) -> bool:
-        """Whether a link between two submaps agrees with the sensors' prediction of their relative pose."""
-        earlier = BEFORE_S in (one.keyframe.stamp_s, one.other.stamp_s)
-        sigma = np.inf if earlier else self.start_sigma(max(self._pieces(one)))
-        return is_near_prediction(self.map, one, sigma) if np.isfinite(sigma) else one.by_images
+        The scale at both ends of a loop without parallax is equal within the drift. Unrelated submaps are linked by
+        images alone, and then need a scale from them.
+        """
+        mine, theirs = self.map.piece_of(keyframe.id), self.map.piece_of(other.id)
+        if mine == theirs:
+            found = link(self.tracker, keyframe, other, LOOP_SHARE, lambda: (1.0, PLACE_LOG))
+            if found is None or (not found.by_images and self._is_flat(found)):
+                return None
+        else:
+            scale_between = lambda: self.graph.scale_between(mine, theirs)  # noqa: E731
+            found = link(self.tracker, keyframe, other, scale_between=scale_between)
+            if found is None:
+                return None
+        belief = self.graph.between(keyframe, other, found.depth)
+        agrees = found.by_images if belief is None else belief.allows(found.S, keyframe.T_c_w)
+        return found if agrees else None
 
     def _is_flat(self, one: Link) -> bool:
         """Whether the anchors of a link lie on one plane, such as a wall with repetitive wallpaper."""
         return on_one_plane(self.map.anchors.p_w[one.anchor], one.depth)
 
-    def align(self, stamp_s: float, now: tuple[float, float] | None = None) -> Rescaled | Turned | None:
-        """Rotate or scale the camera's submap to the flight's first one if the drone's sensors show a difference.
-
-        The caller must own the map.
-
-        Args:
-            stamp_s: Present time.
-            now: Scale of the first submap relative to the camera's by present sensor data, if it differs
-                significantly, and the standard deviation of its logarithm.
-        """
-        records = self.log.records
-        if not records or stamp_s - self._aligned_s < UNIT_AGAIN_S:
-            return None
-        first, piece = (self.map.piece_of(records[k].keyframe_id) for k in (0, -1))
-        if piece == first or piece in self.known_scale:
-            return None
-        self._aligned_s = stamp_s
-        change = self._rotated(stamp_s, piece, first) or self._rescaled(stamp_s, piece, first, now)
-        if change is not None:
-            move_piece(self.map, self.edges, self.log, piece, change.S)
-            self._links = []  # their similarities refer to the submaps before the change
-        return change
-
-    def _rotated(self, stamp_s: float, piece: int, first: int) -> Turned | None:
-        mine, other = (self.facing_along(*self._frames_of(p)) for p in (piece, first))
-        if mine is None or other is None:
-            return None
-        angle, sigma = angle_between(mine, other)
-        if not is_turned(angle, sigma):
-            return None
-        return Turned(stamp_s, piece, turn_about(self._began(piece), mine[0], angle), angle, sigma)
-
-    def _rescaled(self, stamp_s: float, piece: int, first: int, now: tuple[float, float] | None) -> Rescaled | None:
-        for ratio in (self._relative_scale(piece, first), now):  # velocities along all of it; heights only at present
-            if ratio is not None and is_other(*ratio):
-                return Rescaled(stamp_s, piece, about(self._began(piece), ratio[0]), ratio[1])
-        return None
-
-    def _began(self, piece: int) -> FloatArray:
-        """Start of a submap ``(3,)``."""
-        return self.map.keyframes[min(id for id in self.map.keyframes if self.map.piece_of(id) == piece)].centre_w
-
-    def _scale_between(self, keyframe: Keyframe, other: Keyframe) -> tuple[float, float] | None:
-        return self._relative_scale(*(self.map.piece_of(k.id) for k in (keyframe, other)))
-
-    def _relative_scale(self, piece: int, other: int) -> tuple[float, float] | None:
-        """Scale of another submap relative to a submap, from metres along the frames of either."""
-        here, there = self._scale_of(piece), self._scale_of(other)
-        if here is None or there is None:
-            return None
-        sigma = float(np.hypot(here.sigma / here.value, there.sigma / there.value))
-        return here.value / there.value, sigma
-
-    def _scale_of(self, piece: int) -> ScaleEstimate | None:
-        return self.metres_along(*self._frames_of(piece))
-
-    def _frames_of(self, piece: int) -> tuple[FloatArray, FloatArray]:
-        """Stamps ``(F,)`` and poses ``(F, 4, 4)`` of the frames that a submap supports."""
-        support = self.log.support()
-        use = (support.piece == piece) & support.supported
-        stamps_s, T_w_c = self.log.poses()
-        return stamps_s[use], T_w_c[use]
-
-    def _settle(self, found: Link) -> Join | Closure | None:
+    def _settle(self, found: Link) -> MapChange | None:
         """Apply a link if another one confirms it; covisible keyframes are searched for that."""
         agreeing = [found]
         for witness in self._witnesses(found):
@@ -331,7 +252,7 @@ class Atlas:
         for keyframe in self.map.covisible(found.keyframe, WITNESSES):
             for candidate in self._candidates(keyframe, self._candidates_near(keyframe, found), 1):
                 new.append(self._link(keyframe, candidate))
-        return [*known, *(one for one in new if one is not None)]
+        return [*known, *filter(None, new)]
 
     def _candidates_near(self, witness: Keyframe, found: Link) -> list[Keyframe]:
         """Keyframes that a covisible keyframe of a link may see as well."""
@@ -346,74 +267,116 @@ class Atlas:
         """Whether both ends of a link are still in the map."""
         return all(self.map.keyframes.get(k.id) is k for k in (one.keyframe, one.other))
 
-    def _close(self, links: list[Link]) -> Closure | None:
+    # -- changes -----------------------------------------------------------------------------------------------
+
+    def _close(self, links: list[Link]) -> MapChange | None:
         """Close a loop; None if the offset is small, so that sharing anchors suffices."""
         self._links = []
-        if all(is_within_reach(self.map, self.tracker.camera, one) for one in links):
-            with self.map.lock:
-                share_anchors(self.map, links)
+        if all(self._is_within_reach(one) for one in links):
+            share_anchors(self.map, links)
             return None
+        best = max(links, key=lambda one: len(one.keypoint))
+        piece, away_s = self.map.piece_of(best.keyframe.id), best.keyframe.stamp_s - best.other.stamp_s
+        off = best.keyframe.T_c_w @ se3.inverse(sim3.moved_camera(best.S, best.keyframe.T_c_w))
+        shift, turn = np.linalg.norm(off[:3, 3]) / best.depth, np.linalg.norm(se3.log(off)[3:])
         with self.map.lock:  # a consistent snapshot for readers
-            closure = spread(self.map, self.edges, self.log, links)
+            scale_change = self._moved(relaxed(self.map, links, {}))
             share_anchors(self.map, links)
             look_around(self.map, self.tracker.camera, links)  # later windows and the final refinement do the rest
-        self.closures.append(closure)
-        return closure
+        since = f"after {away_s:.1f} s" if np.isfinite(away_s) else "from an earlier flight"
+        return self._changed(
+            "loops_closed",
+            max(one.keyframe.stamp_s for one in links),
+            f"loop closed in piece {piece}, a place seen again {since}: {_evidence(links)}; the camera was off by "
+            f"{100 * shift:.0f} % of the depth and {np.rad2deg(turn):.1f} degrees, the map scaled by "
+            f"{scale_change[best.keyframe.id]:.3f} there",
+            scale_change,
+        )
 
-    def _join(self, links: list[Link]) -> Join:
+    def _is_within_reach(self, one: Link) -> bool:
+        """Whether the correction by a link is small enough for the window."""
+        p_c = se3.transform(one.keyframe.T_c_w, self.map.anchors.p_w[one.anchor])
+        if not (p_c[:, 2] > 0).all():
+            return False
+        off = np.linalg.norm(self.tracker.camera.project(p_c) - one.keyframe.features.uv[one.keypoint], axis=1)
+        scale = abs(np.log(sim3.scale_of(one.S)))
+        return bool(np.median(off) <= WITHIN_PX and scale <= 3.0 * np.hypot(one.sigma_log, LINK_LOG))
+
+    def _join(self, links: list[Link]) -> MapChange:
+        """Merge two submaps: the smaller one is moved. Where sensors relate them, the correction is relative to their
+        prediction the drift of the older one, and is distributed over both."""
         best = max(links, key=lambda one: len(one.keypoint))
         mine, theirs = self._pieces(best)
-        sensed = bridge(self.map, mine, theirs) if np.isfinite(self.start_sigma(max(mine, theirs))) else None
         moved, S = mine, best.S
-        if self._weight(mine) > self._weight(theirs):  # the smaller one moves
+        if self._weight(mine) > self._weight(theirs):
             moved, S = theirs, sim3.inverse(best.S)
-        move_piece(self.map, self.edges, self.log, moved, S)
-        made_up = None
-        if sensed is not None:
-            left = [replace(one, S=S @ one.S if moved == theirs else one.S @ sim3.inverse(S)) for one in links]
-            made_up = self._make_up(left, sensed.scaled(sim3.scale_of(S)) if moved == min(mine, theirs) else sensed)
+        if self._is_sensed(min(mine, theirs), max(mine, theirs)):
+            similarity = relaxed(self.map, links, {moved: S}, sensed=True)
+        else:
+            similarity = dict.fromkeys(self._keyframes_of(moved), S)
+        scale_change = self._moved(similarity)
         merge_submaps(self.map, self.tracker.camera, links, self.lm)
-        join = Join(
-            max(one.keyframe.stamp_s for one in links),
-            min(mine, theirs),
-            max(mine, theirs),
-            moved,
-            S,
-            _sigma_log(best, links),
-            len(links),
-            sum(len(one.keypoint) for one in links),
-            {} if made_up is None else made_up.scale_change,
-        )
-        self.joins.append(join)
-        self._follow_scale(mine, theirs, moved)
         self._again = []
-        self._links = []  # their similarities refer to the submaps before the merge
-        return join
-
-    def _make_up(self, links: list[Link], sensed: Bridge) -> Closure:
-        """Distribute the newer submap's correction over both: relative to the sensors' prediction it is the drift of
-        the older one."""
-        with self.map.lock:
-            for one in links:
-                self.map.join_pieces(one.keyframe, [one.other])
-            return spread(self.map, self.edges, self.log, links, sensed)
-
-    def _weight(self, piece: int) -> tuple[bool, int]:
-        """Order by which a submap stays: metric scale from an earlier flight, then its size."""
-        return piece in self.known_scale, sum(self.map.piece_of(id) == piece for id in self.map.keyframes)
-
-    def _follow_scale(self, mine: int, theirs: int, moved: int) -> None:
-        """The merged submap has the scale of the one that stayed."""
         scales = {piece: self.known_scale.pop(piece, None) for piece in (mine, theirs)}
         stayed = scales[mine if moved == theirs else theirs]
         if stayed is not None:
             self.known_scale[min(mine, theirs)] = stayed
+        return self._changed(
+            "joined",
+            max(one.keyframe.stamp_s for one in links),
+            f"piece {max(mine, theirs)} joined piece {min(mine, theirs)}: {_evidence(links)}, "
+            f"piece {moved} scaled by {sim3.scale_of(S):.3f}",
+            scale_change,
+        )
+
+    def _is_sensed(self, older: int, newer: int) -> bool:
+        """Whether sensors predicted the start of a submap from the last keyframe of another one."""
+        first = min(self._keyframes_of(newer))
+        before = max((id for id in self.map.keyframes if id < first), default=None)
+        start = self.graph.starts.get(newer)
+        return (
+            before is not None
+            and self.map.piece_of(before) == older
+            and start is not None
+            and bool(np.isfinite(start.sigma_t))
+        )
+
+    def _weight(self, piece: int) -> tuple[bool, int]:
+        """Order by which a submap stays: metric scale from an earlier flight, then its size."""
+        return piece in self.known_scale, len(self._keyframes_of(piece))
+
+    def _keyframes_of(self, piece: int) -> list[int]:
+        return [id for id in self.map.keyframes if self.map.piece_of(id) == piece]
+
+    def _moved(self, similarity: dict[int, FloatArray]) -> dict[int, float]:
+        return move(self.map, self.edges, self.graph.log, similarity)
+
+    def _changed(self, kind: str, stamp_s: float, text: str, scale_change: dict[int, float]) -> MapChange:
+        """Record a change; waiting links refer to the map before."""
+        self._links = []
+        change = MapChange(kind, stamp_s, text, scale_change)
+        self.graph.follow(scale_change)
+        self.changes.append(change)
+        return change
 
 
-def _sigma_log(best: Link, links: list[Link]) -> float:
-    """Standard deviation of the log scale of the best of some agreeing links."""
-    between = float(np.std([np.log(sim3.scale_of(one.S)) for one in links]))
-    return float(np.sqrt(best.sigma_log**2 + best.bend_log**2 + between**2))
+def far_keyframes(slam_map: SlamMap, keyframe: Keyframe) -> list[Keyframe]:
+    """Older keyframes of the same submap without a short covisibility path to a keyframe.
+
+    Left out are those that share anchors with it or with its covisible keyframes.
+    """
+    piece = slam_map.piece_of(keyframe.id)
+    older = [k for k in slam_map.keyframes.values() if keyframe.stamp_s - k.stamp_s >= MIN_AWAY_S]
+    older = [k for k in older if slam_map.piece_of(k.id) == piece]
+    if not older:
+        return []
+    around = slam_map.anchors_seen_by([keyframe, *slam_map.covisible(keyframe, len(slam_map.keyframes), MIN_SHARED)])
+    near = slam_map.shared_counts(around)
+    return [k for k in older if near.get(k.id, 0) < MIN_SHARED]
+
+
+def _evidence(links: list[Link]) -> str:
+    return f"{len(links)} keyframes agree, {sum(len(one.keypoint) for one in links)} keypoints"
 
 
 def _is_mapped(keyframe: Keyframe) -> bool:

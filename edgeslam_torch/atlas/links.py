@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgeslam_torch.atlas.submap_graph import Belief
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.robust_statistics import robust_sigma
 from edgeslam_torch.map.keyframe import Keyframe
@@ -20,7 +21,6 @@ from edgeslam_torch.tracking.relocaliser import (
     Place,
     match_keyframe,
     place_of,
-    pose_difference,
 )
 from edgeslam_torch.tracking.tracker import Track, Tracker, View
 from edgeslam_torch.types import FloatArray, IntArray
@@ -45,16 +45,15 @@ PLANE_FITS = 5
 PLANE_SHARE = 0.2
 """Share of the anchors in view that must be matched if they lie on one plane: similar floors and walls in other rooms
 match with 0.12 to 0.16 (docs/decisions/20-loops.md)."""
-MIN_PART = 5
-"""Minimum number of keypoints in a quarter of the view for a median."""
-MAX_SHIFT = 0.1
-"""Distance between two estimates of one camera centre, relative to the depth."""
-MAX_TURN_RAD = np.deg2rad(5.0)
-"""Angle between two estimates of one camera orientation: `MAX_SHIFT` at that depth corresponds to 6 degrees."""
+LINK_PLACE = 0.024
+"""Standard deviation per axis of a camera's centre by a link, relative to the depth."""
+LINK_RAD = np.deg2rad(1.2)
+"""Standard deviation of its orientation; `LINK_PLACE` at that depth corresponds to 1.4 degrees."""
+LINK_LOG = 0.01
+"""Standard deviation of the log scale of a link in a bent map, beside that of its depths."""
 
-
-ScaleBetween = Callable[[Keyframe, Keyframe], tuple[float, float] | None]
-"""Scale of the second keyframe's submap relative to the first one's, and the standard deviation of its log, by sensors
+ScaleBetween = Callable[[], tuple[float, float] | None]
+"""Scale of the other keyframe's submap relative to the keyframe's, and the standard deviation of its log, by sensors
 other than the camera; None if unknown."""
 
 
@@ -69,8 +68,6 @@ class Link:
     """``(4, 4)`` similarity from the keyframe's submap to the other."""
     sigma_log: float
     """Standard deviation of its log scale, if the two submaps differ by a similarity only."""
-    bend_log: float
-    """Variation of the log scale over the image, due to bending of the maps."""
     keypoint: IntArray
     """``(M,)`` matched keypoints of the keyframe."""
     anchor: IntArray
@@ -83,10 +80,9 @@ class Link:
     def agrees(self, other: "Link") -> bool:
         """Whether another link between the same submaps gives the same pose and scale for this keyframe."""
         here, there = (sim3.moved_camera(S, self.keyframe.T_c_w) for S in (self.S, other.S))
-        shift, turn = pose_difference(here, there)
-        scales = np.log(sim3.scale_of(self.S) / sim3.scale_of(other.S))
-        same = abs(scales) <= 3.0 * float(np.hypot(self.sigma_log, other.sigma_log)) + 0.02
-        return bool(same and shift <= MAX_SHIFT * self.depth and turn <= MAX_TURN_RAD)
+        sigma_log = float(np.linalg.norm([self.sigma_log, other.sigma_log, LINK_LOG]))
+        scales = float(np.log(sim3.scale_of(self.S) / sim3.scale_of(other.S)))
+        return Belief(LINK_PLACE * self.depth, LINK_RAD, 0.0, sigma_log).allows_pose(here, there, scales)
 
 
 def view_of(keyframe: Keyframe, scale_factor: float) -> View:
@@ -100,7 +96,7 @@ def link(
     keyframe: Keyframe,
     other: Keyframe,
     min_share: float = LIKELY_SHARE,
-    scale_between: ScaleBetween = lambda *_: None,
+    scale_between: ScaleBetween = lambda: None,
 ) -> Link | None:
     """Pose of a keyframe in another keyframe's submap; None unless it is verified.
 
@@ -116,23 +112,20 @@ def link(
         return None
     if there.share < PLANE_SHARE and on_one_plane(tracker.map.anchors.p_w[there.track.anchor], there.depth):
         return None
-    common = _common_depths(tracker, keyframe, there.track)
-    by_images = len(common.own) >= MIN_COMMON
-    if by_images:
-        scale = _agreed(keyframe, common)
-    else:
-        scale = _by_sensors(scale_between, keyframe, other) if there.share >= SENSOR_SCALE_SHARE else None
+    ratio = log_ratios(tracker, keyframe, there.track)
+    by_images = len(ratio) >= MIN_COMMON
+    if not by_images and there.share < SENSOR_SCALE_SHARE:
+        return None
+    scale = agreed_scale(ratio) if by_images else scale_between()
     if scale is None:
         return None
-    S = _similarity(keyframe.T_c_w, there.track.T_c_w, scale[0])
+    S = se3.inverse(there.track.T_c_w) @ sim3.compose(scale[0], np.eye(3), np.zeros(3)) @ keyframe.T_c_w
     back = _place(tracker, other, keyframe, min_share)
-    if back is None:
-        return None
-    shift, turn = pose_difference(back.track.T_c_w, sim3.moved_camera(sim3.inverse(S), other.T_c_w))
-    if shift > MAX_SHIFT * back.depth or turn > MAX_TURN_RAD:
+    expected = sim3.moved_camera(sim3.inverse(S), other.T_c_w)
+    if back is None or not Belief(LINK_PLACE * back.depth, LINK_RAD).allows_pose(expected, back.track.T_c_w):
         return None
     track = there.track
-    return Link(keyframe, other, S, scale[1], scale[2], track.keypoint, track.anchor, there.depth, by_images)
+    return Link(keyframe, other, S, scale[1], track.keypoint, track.anchor, there.depth, by_images)
 
 
 def _place(tracker: Tracker, keyframe: Keyframe, other: Keyframe, min_share: float) -> Place | None:
@@ -156,63 +149,24 @@ def on_one_plane(p: FloatArray, depth: float) -> bool:
     return bool(np.quantile(off, PLANE_PART) <= ON_PLANE * depth)
 
 
-@dataclass(frozen=True, slots=True)
-class _Depths:
-    """Depths of keypoints with a triangulated anchor on both sides ``(C,)``, in either submap's units."""
-
-    own: FloatArray
-    there: FloatArray
-    keypoint: IntArray
-
-
-def common_scale(tracker: Tracker, keyframe: Keyframe, track: Track) -> tuple[float, float, float] | None:
-    """Scale of the track's submap relative to the keyframe's, the standard deviation of its log, and its bend.
-
-    None if too few depths are known on both sides or they do not agree.
-    """
-    common = _common_depths(tracker, keyframe, track)
-    return _agreed(keyframe, common) if len(common.own) >= MIN_COMMON else None
-
-
-def _common_depths(tracker: Tracker, keyframe: Keyframe, track: Track) -> _Depths:
+def log_ratios(tracker: Tracker, keyframe: Keyframe, track: Track) -> FloatArray:
+    """Logarithms ``(C,)`` of the depth in the track's submap over that in the keyframe's own, of keypoints with a
+    triangulated anchor in both."""
     anchors = tracker.map.anchors
     own = keyframe.anchor[track.keypoint]
     both = (own >= 0) & ~anchors.from_depth[own] & ~anchors.from_depth[track.anchor]
     z_own = se3.transform(keyframe.T_c_w, anchors.p_w[own[both]])[:, 2]
     z_there = se3.transform(track.T_c_w, anchors.p_w[track.anchor[both]])[:, 2]
     front = (z_own > 0) & (z_there > 0)
-    return _Depths(z_own[front], z_there[front], track.keypoint[both][front])
+    return np.log(z_there[front] / z_own[front])
 
 
-def _agreed(keyframe: Keyframe, common: _Depths) -> tuple[float, float, float] | None:
-    """Common scale of the depths; None if they do not agree."""
-    ratio = np.log(common.there / common.own)
+def agreed_scale(ratio: FloatArray) -> tuple[float, float] | None:
+    """Common scale of logarithms of depth ratios ``(C,)`` and the standard deviation of its log; None if they do not
+    agree."""
     middle = float(np.median(ratio))
     agreeing = ratio[np.abs(ratio - middle) <= AGREE_LOG]
     sigma = robust_sigma(ratio - middle) / np.sqrt(len(ratio))
     if len(agreeing) < MIN_AGREEING * len(ratio) or sigma > MAX_SIGMA_LOG:
         return None
-    bend = _bend(ratio, common.there, keyframe.features.uv[common.keypoint, 0])
-    return float(np.exp(np.mean(agreeing))), max(sigma, 1e-3), bend
-
-
-def _by_sensors(scale_between: ScaleBetween, keyframe: Keyframe, other: Keyframe) -> tuple[float, float, float] | None:
-    """The same from other sensors, without bend."""
-    found = scale_between(keyframe, other)
-    return None if found is None else (*found, 0.0)
-
-
-def _bend(ratio: FloatArray, depth: FloatArray, u: FloatArray) -> float:
-    """Scatter of the log scale between near and far, left and right, beyond that of single keypoints ``(N,)``."""
-    far, right = depth > np.median(depth), u > np.median(u)
-    quarters = [ratio[(far == f) & (right == r)] for f in (False, True) for r in (False, True)]
-    parts = [quarter for quarter in quarters if len(quarter) >= MIN_PART]
-    if len(parts) < 2:
-        return 0.0
-    chance = np.mean([robust_sigma(part - np.median(part)) ** 2 / len(part) for part in parts])
-    return float(np.sqrt(max(0.0, np.var([np.median(part) for part in parts], ddof=1) - chance)))
-
-
-def _similarity(T_c_own: FloatArray, T_c_there: FloatArray, scale: float) -> FloatArray:
-    """Similarity from the world of one pose of a camera to the world of its other pose."""
-    return se3.inverse(T_c_there) @ sim3.compose(scale, np.eye(3), np.zeros(3)) @ T_c_own
+    return float(np.exp(np.mean(agreeing))), max(sigma, 1e-3)

@@ -15,12 +15,12 @@ FOUND = "localised in the map of an earlier flight"
 class PriorMaps:
     """The atlas that a flight began with."""
 
-    flights: tuple[str, ...]
+    flights: tuple[str, ...] = ()
     """Their names, oldest first."""
-    keyframes: int
+    keyframes: int = 0
     """Number of loaded keyframes."""
-    pieces: int
-    """Number of loaded submaps, 0 to ``pieces`` - 1."""
+    pieces: int = 0
+    """Number of loaded submaps, 0 to ``pieces`` - 1; none without an atlas."""
     begin_s: float = math.inf
     """Stamp of this flight's first frame."""
     found_s: float = math.inf
@@ -38,8 +38,10 @@ class PriorMaps:
         """Number of frames supported by submaps of earlier flights, including later additions."""
         return int((support.supported & (support.piece < self.pieces)).sum())
 
-    def summary(self, support: Support, slam_map: SlamMap) -> dict[str, Any]:
-        """For ``summary.json``."""
+    def summary(self, support: Support, slam_map: SlamMap) -> dict[str, Any] | None:
+        """For ``summary.json``; None without an atlas."""
+        if not self.pieces:
+            return None
         inside = [k for k in slam_map.keyframes.values() if slam_map.piece_of(k.id) < self.pieces]
         return {
             "flights": list(self.flights),
@@ -51,6 +53,6 @@ class PriorMaps:
 
     def warning(self, support: Support) -> str | None:
         """Warning if this flight's map was not merged with the loaded one."""
-        if self.placed(support) > 0:
+        if not self.pieces or self.placed(support) > 0:
             return None
         return "no place of the atlas was recognised: this flight's map and poses do not relate to it"

@@ -9,8 +9,7 @@ from edgeslam_torch.estimation.remembered import Remembered
 from edgeslam_torch.estimation.scale.camera_mount import Turned, mount_by_turns
 from edgeslam_torch.estimation.telemetry.alignment import LATELY, attitudes, map_to_world
 from edgeslam_torch.estimation.telemetry.comparison import MOST_APART_RAD
-from edgeslam_torch.estimation.telemetry.visual_memory import Sightings
-from edgeslam_torch.geometry.rotations import mean_rotation, rotation_vector, turn_left
+from edgeslam_torch.geometry.rotations import rotation_vector
 from edgeslam_torch.types import FloatArray
 
 _TURNED_S = 5.0
@@ -19,8 +18,6 @@ _AT_ONCE_S = 0.5
 """Time after the first frame in which the first attitude must arrive to level the map: five messages."""
 _STAMPED_S = 0.05
 """Standard deviation of a message's stamp: half the message interval."""
-_LEAST_FACING = 30
-"""Minimum number of frames for the heading of a submap: one or two seconds."""
 
 
 class Orientation:
@@ -115,21 +112,6 @@ class Orientation:
         R_m_c = R_w_m.T @ flight.track.attitude(around) @ R_b_c
         doubt = max(float(np.linalg.norm(rotation_vector(R_m_c[0].T @ R_m_c[k]))) for k in (1, 2))
         return R_m_c[0].T, doubt
-
-    def facing_along(self, stamps_s: FloatArray, T_w_c: FloatArray) -> tuple[FloatArray, float] | None:
-        """``R_w_m`` ``(3, 3)`` of some frames, ``(F,)`` and ``(F, 4, 4)``, and the standard deviation of its heading
-        [rad]: scatter, and the error of the mount. None without validated telemetry for enough of them."""
-        flight = self._flight
-        if not (flight.trust.turns and math.isfinite(flight.delay_sigma_s)):
-            return None
-        shown = Sightings(stamps_s, T_w_c, np.zeros(len(stamps_s)))
-        pairs = attitudes(shown, flight.track, flight.delay_s)
-        if pairs is None or len(pairs.stamp_s) < _LEAST_FACING:
-            return None
-        each = pairs.R_w_b @ self.T_b_c[:3, :3] @ np.swapaxes(pairs.R_m_c, 1, 2)
-        R_w_m = mean_rotation(each)
-        angle = turn_left(each @ R_w_m.T)
-        return R_w_m, math.hypot(flight.config.alignment_sigma_rad, float(np.sqrt(np.mean(angle**2))))
 
     def upright(self) -> FloatArray | None:
         """``R_w_m`` if attitude may level the world: when it was validated, or arrived with the first frame."""

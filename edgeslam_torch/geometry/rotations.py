@@ -63,16 +63,6 @@ def wrapped(angle: FloatArray) -> FloatArray:
     return (np.asarray(angle) + math.pi) % (2.0 * math.pi) - math.pi
 
 
-def turn_left(R: FloatArray) -> FloatArray:
-    """Angle [rad] about the z axis, positive to the left, nearest to rotations ``(..., 3, 3)``.
-
-    Example:
-        >>> round(float(turn_left(matrix_from_rpy(np.array([0.0, 0.0, 0.4])))), 6)
-        0.4
-    """
-    return np.asarray(np.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1]))
-
-
 def mean_rotation(R: FloatArray, weights: FloatArray | None = None) -> FloatArray:
     """Chordal mean ``(3, 3)`` of rotations ``(N, 3, 3)`` (Hartley et al. 2013, section 5.3)."""
     M = np.tensordot(np.ones(len(R)) if weights is None else weights, R, axes=1)

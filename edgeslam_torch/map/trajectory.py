@@ -114,6 +114,15 @@ class TrajectoryLog:
             pieces.append(Piece(int(number), len(mine), supported, stamps[mine[0]], stamps[mine[-1]], begun))
         return pieces
 
+    def warning(self) -> str | None:
+        """Warning that submaps were never merged; None for a single one."""
+        pieces = [p for p in self.pieces() if p.supported > 0]
+        if len(pieces) < 2:
+            return None
+        began_s = self.records[0].stamp_s
+        spans = ", ".join(f"{p.number} ({p.first_s - began_s:.1f} to {p.last_s - began_s:.1f} s)" for p in pieces)
+        return f"the map is in {len(pieces)} pieces that were never joined, {spans}: poses across them do not relate"
+
     def poses(self, since_s: float = -math.inf) -> tuple[FloatArray, FloatArray]:
         """Stamps ``(F,)`` and ``T_w_c`` ``(F, 4, 4)`` in the map as it is now, of frames not older than ``since_s``."""
         first = bisect.bisect_left(self.records, since_s, key=lambda r: r.stamp_s)

@@ -2,7 +2,7 @@
 
 A search of a few pixels (`mapping/fuse.py`) misses anchors that drift has moved farther. Here an old keyframe's
 anchors are searched in a larger radius and accepted if one camera pose explains them. The poses must already be near
-each other; `atlas/loops.py` recognises places that drift has put elsewhere.
+each other; `atlas/atlas.py` recognises places that drift has put elsewhere.
 """
 
 import logging

@@ -41,7 +41,7 @@ class Lost:
     def miss(self, frame: Frame, view: View, T_predicted: FloatArray, lost_since_s: float) -> Step:
         """Predict the pose, or start a new submap there after a longer loss."""
         system = self.system
-        self.tracking.retroactive.keep(frame.index, view)
+        self.tracking.lost.append((frame.index, view))
         system.motion.drift(T_predicted)
         system.fusion.add_visual(frame.stamp_s, se3.inverse(T_predicted), np.inf, np.inf, tracked=False)
         seen = len(view.features.uv)

@@ -13,7 +13,6 @@
 """
 
 import math
-from collections import Counter
 from enum import StrEnum
 
 
@@ -45,24 +44,17 @@ class Event(StrEnum):
     NOTHING = "not found"
 
 
-_FOUND = {Event.POINTS: State.TRACKING, Event.EDGES: State.EDGES_ONLY, Event.NOTHING: State.LOST}
-
-TRANSITIONS: dict[State, dict[Event, State]] = {
-    State.STARTING: {
-        Event.WAITING: State.STARTING,
-        Event.BEGUN: State.STARTING,  # the first keyframe left the view: next attempt
-        Event.NO_TEXTURE: State.LOST,
-        Event.MAP_READY: State.TRACKING,
-        Event.RETURNED: State.TRACKING,
-    },
-    State.TRACKING: _FOUND,
-    State.EDGES_ONLY: _FOUND,
-    State.LOST: {Event.POINTS: State.TRACKING, Event.NOTHING: State.LOST, Event.BEGUN: State.STARTING},
+NEXT: dict[Event, State] = {
+    Event.BEGUN: State.STARTING,  # also when the first keyframe has left the view: next attempt
+    Event.WAITING: State.STARTING,
+    Event.NO_TEXTURE: State.LOST,
+    Event.MAP_READY: State.TRACKING,
+    Event.RETURNED: State.TRACKING,
+    Event.POINTS: State.TRACKING,
+    Event.EDGES: State.EDGES_ONLY,
+    Event.NOTHING: State.LOST,
 }
-"""Transitions. The states cause no other events; an event leads to the same state wherever it is listed."""
-
-LEADS_TO: dict[Event, State] = {event: state for row in TRANSITIONS.values() for event, state in row.items()}
-"""State after each event, also after one that its state does not list."""
+"""State after each event, from whichever state."""
 
 
 class Machine:
@@ -82,14 +74,10 @@ class Machine:
         """Frames in a row without a pose."""
         self.lost_since_s = math.inf
         """Stamp of the first of them; infinite while not lost, minus infinity without a map to relocalise in."""
-        self.unexpected: Counter[str] = Counter()
-        """Events that their state does not list: programming errors, counted by state and event."""
 
     def apply(self, event: Event, stamp_s: float) -> None:
-        """Apply an event. One that the current state does not list is counted and applied all the same."""
-        if event not in TRANSITIONS[self.state]:
-            self.unexpected[f"{event} while {self.state}"] += 1
-        self.state = LEADS_TO[event]
+        """Apply the event of a frame."""
+        self.state = NEXT[event]
         if self.state is not State.LOST:
             self.lost_frames, self.lost_since_s = 0, math.inf
             return
@@ -98,10 +86,3 @@ class Machine:
             self.lost_since_s = -math.inf
         elif self.lost_frames == 1:
             self.lost_since_s = stamp_s
-
-    def warning(self) -> str | None:
-        """Unlisted transitions that occurred; None if there were none."""
-        if not self.unexpected:
-            return None
-        cases = ", ".join(f"{what} ({count} times)" for what, count in self.unexpected.items())
-        return f"transitions that the table of states does not list: {cases}; please report this"

@@ -3,10 +3,12 @@
 A kidnapped camera sees its new place at once, but that place is mapped or recognised later.
 """
 
+from collections import deque
+
 from edgeslam_torch.map.keyframe import Keyframe
-from edgeslam_torch.states.system import System
+from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.tracking.relocaliser import LIKELY_SHARE, place_of
-from edgeslam_torch.tracking.tracker import View
+from edgeslam_torch.tracking.tracker import Tracker, View
 from edgeslam_torch.types import FloatArray, IntArray
 
 MAX_FRAMES = 60
@@ -14,39 +16,32 @@ MAX_FRAMES = 60
 MISSES = 2
 """Consecutive failures after which the search through earlier frames stops."""
 
+Frames = deque[tuple[int, View]]
+"""Frames by their index."""
 
-class RetroactiveLocalisation:
-    """Stores the frames of the current loss."""
 
-    def __init__(self, system: System) -> None:
-        self.system = system
-        self._lost: list[tuple[int, View]] = []
+def place_lost_frames(
+    lost: Frames, tracker: Tracker, log: TrajectoryLog, keyframe: Keyframe, T_c_w: FloatArray, anchors: IntArray
+) -> int:
+    """Track lost frames one by one, newest first, and forget them; returns the number of localised ones.
 
-    def keep(self, index: int, view: View) -> None:
-        """Store a frame without a pose by its index; beyond the limit the oldest is dropped."""
-        self._lost = [*self._lost[1 - MAX_FRAMES :], (index, view)]
-
-    def place(self, keyframe: Keyframe, T_c_w: FloatArray, anchors: IntArray) -> int:
-        """Track the lost frames one by one, newest first.
-
-        Args:
-            keyframe: Reference keyframe for their poses.
-            T_c_w: ``(4, 4)`` pose of the frame that followed them.
-            anchors: Anchors visible in that frame.
-
-        Returns:
-            Number of frames localised.
-        """
-        tracker, poses, missed = self.system.tracker, {}, 0
-        for index, view in reversed(self._lost):
-            track = tracker.track(view, T_c_w, anchors)
-            if track is None or place_of(tracker, view, track).share < LIKELY_SHARE:
-                missed += 1
-                if missed >= MISSES:
-                    break
-                continue
-            T_c_w, anchors, missed = track.T_c_w, track.anchor, 0
-            poses[index] = T_c_w
-        self._lost = []
-        self.system.log.replace(poses, [keyframe])
-        return len(poses)
+    Args:
+        lost: Frames without a pose.
+        tracker: With the map.
+        log: Receives their poses.
+        keyframe: Reference keyframe for these.
+        T_c_w: ``(4, 4)`` pose of the frame that followed them.
+        anchors: Anchors visible in that frame.
+    """
+    poses, missed = {}, 0
+    while lost and missed < MISSES:
+        index, view = lost.pop()
+        track = tracker.track(view, T_c_w, anchors)
+        if track is None or place_of(tracker, view, track).share < LIKELY_SHARE:
+            missed += 1
+            continue
+        T_c_w, anchors, missed = track.T_c_w, track.anchor, 0
+        poses[index] = T_c_w
+    lost.clear()
+    log.replace(poses, [keyframe])
+    return len(poses)

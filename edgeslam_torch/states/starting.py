@@ -13,7 +13,7 @@ from edgeslam_torch.map.depth_prior import sample
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.states.machine import Event
-from edgeslam_torch.states.retroactive_localisation import MAX_FRAMES
+from edgeslam_torch.states.retroactive_localisation import MAX_FRAMES, Frames
 from edgeslam_torch.states.step import Step
 from edgeslam_torch.states.system import MIN_KEYPOINTS, System
 from edgeslam_torch.states.tracking import Tracking
@@ -70,7 +70,7 @@ class Starting:
             most = min(MAX_WAITING_IN_REAL_TIME, self.config.max_keyframes)
             self.config = replace(self.config, max_keyframes=most)
         self._attempt: Bootstrap | None = None
-        self._seen: list[tuple[int, View]] = []
+        self._seen: Frames = Frames(maxlen=MAX_FRAMES)
         """Newest frames of the attempt, localised later if an earlier submap is recognised."""
 
     def begin(self, frame: Frame, view: View, reason: str) -> Step:
@@ -98,14 +98,14 @@ class Starting:
             system.mapping.look(frame, keyframe)
         guess = self._guess_depth(keyframe)
         slam_map.begin_piece(reason)
-        system.begin_submap(slam_map.piece, frame.stamp_s)
-        system.fusion.begin_piece()
         colour = colours_at(keyframe.image, view.features.uv)
-        self._seen = [(frame.index, view)]
+        self._seen.clear()
+        self._seen.append((frame.index, view))
         corner = self._corners(frame, view)
         self._attempt = Bootstrap(
             slam_map, system.tracker, self.config, keyframe, guess, colour, system.config.seed, corner
         )
+        system.begin_submap(keyframe)
         slam_map.remove_empty_keyframes()
         return Step(Event.BEGUN, keyframe, FrameStatus.STARTING, reason, is_keyframe=True)
 
@@ -119,10 +119,9 @@ class Starting:
             track = self._track(attempt, frame, view) if back is None else None
         if back is not None:
             self._give_up()
-            for index, its_view in self._seen:
-                self.tracking.retroactive.keep(index, its_view)
+            self.tracking.lost.extend(self._seen)
             return replace(self.tracking.return_to(frame, seen, back.T_c_w, back), event=Event.RETURNED)
-        self._seen = [*self._seen[1 - MAX_FRAMES :], (frame.index, view)]
+        self._seen.append((frame.index, view))
         if track is None or track.inliers < MIN_INLIERS:
             self.system.events["restarted"] += 1
             self.system.motion.stop()
@@ -181,7 +180,7 @@ class Starting:
         """Hand over to tracking with the new map."""
         assert self._attempt is not None
         reference, keyframe = self._attempt.reference, started.new[-1][1]
-        self._attempt, self._seen = None, []
+        self._attempt = None
         system = self.system
         system.log.replace(started.T_c_w, [reference, *(k for _, k in started.new)])
         system.add_earlier(reference.stamp_s, track)
@@ -190,7 +189,7 @@ class Starting:
         system.edges.announce(reference)
         system.compare_depth(reference)
         self.tracking.begin(seen, started.new)
-        self.tracking.retroactive.place(reference, reference.T_c_w, reference.anchor[reference.anchor >= 0])
+        self.tracking.place_lost(reference, reference.T_c_w, reference.anchor[reference.anchor >= 0])
         return Step(
             Event.MAP_READY, keyframe, FrameStatus.INITIALISED, reason, track, two_view.parallax_rad, is_keyframe=True
         )

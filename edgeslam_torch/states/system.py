@@ -1,15 +1,16 @@
 """Parts shared by all states: map, motion, scale, and the creation of keyframes."""
 
-import math
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from edgeslam_torch.atlas.submap_graph import SubmapGraph
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.estimation.motion import MotionFusion
-from edgeslam_torch.estimation.output_frame import OutputFrame
+from edgeslam_torch.estimation.output_frame import OutputFrame, first_pose
 from edgeslam_torch.estimation.prediction import PoseEstimate
 from edgeslam_torch.estimation.scale.depth_scale import DepthRatio, compared
 from edgeslam_torch.geometry import se3
@@ -20,13 +21,11 @@ from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
 from edgeslam_torch.stage_times import timed
-from edgeslam_torch.states.drift import SHARE, Drift
-from edgeslam_torch.states.submap_uncertainty import SubmapUncertainty
 from edgeslam_torch.tracking.motion_model import MotionModel
 from edgeslam_torch.tracking.pose_prior import Attitude, Place, SensorPrior, TrackingPrior, Vertical
 from edgeslam_torch.tracking.relocaliser import Reach, reach_after
 from edgeslam_torch.tracking.tracker import Track, Tracker
-from edgeslam_torch.types import FloatArray, Frame
+from edgeslam_torch.types import FloatArray, Frame, TelemetrySample
 
 MIN_KEYPOINTS = 100
 """Fewer keypoints than this cannot start a map."""
@@ -58,6 +57,7 @@ class System:
     mapping: MappingPipeline
     fusion: MotionFusion
     motion: MotionModel
+    graph: SubmapGraph
     published: OutputFrame = field(default_factory=OutputFrame)
     events: dict[str, int] = field(
         default_factory=lambda: {
@@ -73,12 +73,6 @@ class System:
     has_telemetry: bool = False
     piece_began_s: float = -np.inf
     """Stamp of the frame with which the newest submap began."""
-    submap_uncertainty: SubmapUncertainty = field(default_factory=SubmapUncertainty)
-    submap_sigma: float = 0.0
-    """As in `Health`, of the newest tracked frame."""
-    drift: Drift = field(default_factory=Drift)
-    drift_sigma: float = 0.0
-    """As in `Health`, of the newest keyframe that has been mapped."""
     keyframe_s: float = -np.inf
     """Stamp of the newest keyframe, or of a later frame that needed not become one."""
     shows_nothing_new: bool = False
@@ -87,6 +81,18 @@ class System:
     """Sensor prior of one frame by its stamp; it is used several times."""
     stage_ms: dict[str, float] = field(default_factory=dict)
     """Times of the current frame."""
+
+    def begin_flight(
+        self, stamp_s: float, telemetry: Sequence[TelemetrySample], T_b_c: FloatArray, keeps_axes: bool
+    ) -> None:
+        """The first frame: attitude turns the first camera so that the world's z is up, unless a loaded map
+        ``keeps_axes``."""
+        self.fusion.orientation.began_s = stamp_s
+        if telemetry:
+            self.motion.T_c_w = se3.inverse(first_pose(telemetry[-1].rpy_rad, T_b_c))
+            upright = bool(np.isfinite(telemetry[-1].rpy_rad).all())
+            self.published = replace(self.published, upright=upright)
+            self.fusion.orientation.began_upright = upright and not keeps_axes
 
     def timed(self, stage: str) -> AbstractContextManager[None]:
         """Add the time spent inside to a stage of the current frame."""
@@ -153,20 +159,14 @@ class System:
         T_w_c = se3.inverse(track.T_c_w)
         with self.timed("fusion"):
             self.fusion.add_visual(stamp_s, T_w_c, *_sigmas(track))
-            keep_scale = bool(self.submap_uncertainty.starts) and self.scale_ratio() is not None
-            self.published = self.fusion.republished(self.published, T_w_c[:3, 3], keep_scale)
-        if self.submap_uncertainty.starts:
-            self.submap_sigma = self._submap_sigma(self._piece())
+            self.published = self.fusion.republished(self.published, T_w_c[:3, 3], self.graph.keeps_scale)
 
-    def scale_ratio(self) -> tuple[float, float] | None:
-        """As `SubmapUncertainty.scale_ratio`, of the camera's submap, if the present estimate would change the
-        published scale: the submap is then rescaled, since earlier output is in the published scale."""
-        scale, piece = self.fusion.scale(), self._piece()
-        return self.submap_uncertainty.scale_ratio(piece, scale) if self.published.is_wrong_by(scale) else None
-
-    def _piece(self) -> int:
-        """Submap of the newest frame."""
-        return self.map.piece_of(self.log.records[-1].keyframe_id)
+    def position_sigmas(self, piece: int) -> tuple[float, float]:
+        """`Health.submap_sigma` and `drift_sigma` of the present pose in a submap."""
+        if not self.log.records:
+            return 0.0, 0.0
+        apart, _ = self.graph.apart(piece, self.graph.first, se3.inverse(self.motion.T_c_w)[:3, 3])
+        return self.published.scale * apart, self.published.scale * self.graph.drift
 
     def add_earlier(self, since_s: float, track: Track) -> None:
         """Pass logged frames since a stamp to the fusion once a map supports them; covariance from ``track``."""
@@ -174,31 +174,12 @@ class System:
         with self.timed("fusion"):
             self.fusion.add_earlier(stamps_s, T_w_c, *_sigmas(track))
 
-    def begin_submap(self, piece: int, stamp_s: float) -> None:
-        """A submap begins at the current, predicted pose."""
-        earlier = (self.map.piece_of(r.keyframe_id) for r in reversed(self.log.records))
-        before, predicted = next((p for p in earlier if p != piece), None), self.sensor_prediction(stamp_s)
-        if before is not None:
-            if before not in self.submap_uncertainty.starts:
-                self.submap_uncertainty.unit = self.fusion.scale()
-            sigma_t, sigma_r = (np.inf, np.inf) if predicted is None else (predicted.sigma_t, predicted.sigma_r_rad)
-            self.submap_uncertainty.begin(piece, before, se3.inverse(self.motion.T_c_w)[:3, 3], sigma_t, sigma_r)
-            self.submap_sigma = self._submap_sigma(piece)
-
-    def _submap_sigma(self, piece: int) -> float:
-        return self.published.scale * self.between(piece, self._first_piece())
-
-    def between(self, piece: int, other: int) -> float:
-        """Standard deviation per axis [map units] of the camera's position in one submap as seen from another;
-        infinite for unrelated ones, as those of an earlier flight."""
-        if piece == other:
-            return 0.0
-        scale, centre = self.fusion.scale(), se3.inverse(self.motion.T_c_w)[:3, 3]
-        later = {piece, other} - {self._first_piece()}
-        return math.hypot(*(self.submap_uncertainty.sigma(p, centre, scale.sigma / scale.value) for p in later))
-
-    def _first_piece(self) -> int:
-        return self.map.piece_of(self.log.records[0].keyframe_id)
+    def begin_submap(self, keyframe: Keyframe) -> None:
+        """A submap begins with a keyframe at the present, predicted pose."""
+        predicted = self.sensor_prediction(keyframe.stamp_s)
+        sigma = (np.inf, np.inf) if predicted is None else (predicted.sigma_t, predicted.sigma_r_rad)
+        self.graph.begin(self.map.piece, keyframe, *sigma)
+        self.fusion.begin_piece()
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 
@@ -230,9 +211,8 @@ class System:
         self.fusion.map_moved(se3.inverse(self.motion.T_c_w) @ before)
         self.stage_ms.update(mapped.stage_ms)
         for keyframe in mapped.keyframes:
-            self.drift.add(self.map, keyframe)
+            self.graph.add(keyframe)
             self.compare_depth(keyframe)
-        self.drift_sigma = SHARE * self.published.scale * self.drift.newest
         return True
 
     def compare_depth(self, keyframe: Keyframe) -> None:

@@ -1,18 +1,16 @@
 """Tracking in the map by flow, by matching, and by edges where points are few; creation of keyframes."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
-from edgeslam_torch.atlas.loops import MAX_DRIFT_RAD, SIGMAS, is_near
 from edgeslam_torch.atlas.place_recognition import revisit_candidates
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe, tracked_motion
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
 from edgeslam_torch.states.machine import Event
-from edgeslam_torch.states.retroactive_localisation import RetroactiveLocalisation
+from edgeslam_torch.states.retroactive_localisation import MAX_FRAMES, Frames, place_lost_frames
 from edgeslam_torch.states.step import Located, Step
 from edgeslam_torch.states.system import System
 from edgeslam_torch.tracking.edge_tracker import MIN_EDGES, EdgeTracker, PointsInFrame
@@ -27,7 +25,7 @@ from edgeslam_torch.tracking.flow import (
 )
 from edgeslam_torch.tracking.keyframe_choice import KNOWN_SHARE, due_by_flow, few_matches, is_due, known_share
 from edgeslam_torch.tracking.lazy_view import LazyView
-from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, candidates, pose_difference
+from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, candidates
 from edgeslam_torch.tracking.tracker import Track, View, make_view, parallax_to
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus, IntArray
 
@@ -45,7 +43,8 @@ class Tracking:
         )
         self._edge_tracker = EdgeTracker(system.map, system.edges, system.camera, system.config.tracking.edges)
         self.relocaliser = Relocaliser(system.tracker)
-        self.retroactive = RetroactiveLocalisation(system)
+        self.lost: Frames = Frames(maxlen=MAX_FRAMES)
+        """Newest frames of the present loss."""
         self._template: Template | None = None
         """Template for tracking the next frames; None without a map."""
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
@@ -127,8 +126,12 @@ class Tracking:
         located = self._located(track, seen.view, seen, frame.stamp_s, due=False, relocalised=True)
         step = self.arrive(frame, seen, T_predicted, located)
         self.system.motion.stop()
-        self.retroactive.place(step.keyframe, track.T_c_w, track.anchor)
+        self.place_lost(step.keyframe, track.T_c_w, track.anchor)
         return step
+
+    def place_lost(self, keyframe: Keyframe, T_c_w: FloatArray, anchors: IntArray) -> None:
+        """Localise the frames of the present loss from the pose of the frame that followed them."""
+        place_lost_frames(self.lost, self.system.tracker, self.system.log, keyframe, T_c_w, anchors)
 
     def arrive(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Step:
         """Accept the frame's pose, and insert a keyframe if one is due."""
@@ -245,23 +248,20 @@ class Tracking:
         return found.track
 
     def _may_be_at(self, track: Track, stamp_s: float) -> bool:
-        """Whether a relocalised pose is within reach of the sensors' prediction: on repetitive walls several frames
-        match metres away. Images decide alone without sensors, in the map of an earlier flight, and in a submap that is
-        unrelated to the camera's."""
+        """Whether a relocalised pose agrees with the sensors' prediction: on repetitive walls several frames match
+        metres away. Images decide alone without sensors, and where nothing relates both places."""
         system = self.system
         predicted, records = system.sensor_prediction(stamp_s), system.log.records
         if predicted is None or not records:
             return True
-        here, there = system.map.resolve(records[-1].keyframe_id)[0], system.tracker.local_keyframes(track.anchor)[0]
-        between = system.between(system.map.piece_of(here), system.map.piece_of(there.id))
-        if there.stamp_s == BEFORE_S or not math.isfinite(between):
-            return True
-        shift, turn = pose_difference(track.T_c_w, se3.inverse(predicted.T_w_c))
+        here = system.map.keyframes[system.map.resolve(records[-1].keyframe_id)[0]]
+        there = system.tracker.local_keyframes(track.anchor)[0]
         depth = float(np.median(se3.transform(track.T_c_w, system.map.anchors.p_w[track.anchor])[:, 2]))
-        sigma = math.hypot(predicted.sigma_t, between)
-        return turn <= MAX_DRIFT_RAD + SIGMAS * predicted.sigma_r_rad and is_near(
-            system.map, system.map.keyframes[here], there, shift, depth, sigma
-        )
+        belief = system.graph.between(here, there, depth)
+        if belief is None or there.stamp_s == BEFORE_S:
+            return True
+        belief = belief.plus(predicted.sigma_t, predicted.sigma_r_rad)
+        return belief.allows_pose(se3.inverse(predicted.T_w_c), track.T_c_w)
 
     # -- by edges ----------------------------------------------------------------------------------------------
 

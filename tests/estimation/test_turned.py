@@ -67,31 +67,3 @@ def test_a_camera_that_was_long_lost_is_told_nothing(rng, swinging, replay):
     told = asked(rng, swinging(30.0), replay, untracked_s=(14.0, 22.0))
     after = round((20.0 - PROVEN_S) * 20.0)
     assert told[after] is None and told[after + 80] is not None
-
-
-@pytest.mark.parametrize("angle", [0.4, -0.9])
-def test_how_a_map_is_turned_is_told_by_frames_of_it(rng, swinging, replay, angle):
-    """Frames of a piece that lies turned about the vertical, beside those of the map that the fusion knows."""
-    motion = swinging(24.0)
-    gauge = motion.in_gauge(rng)
-    fusion = MotionFusion(FusionConfig(), T_B_C)
-    replay(fusion, motion, gauge, simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples())
-    facing_along = fusion.orientation.facing_along
-    R_w_m, sigma = facing_along(motion.stamps_s[100:300], gauge.T_m_c[100:300])
-    turn = Rotation.from_rotvec(angle * R_w_m[2]).as_matrix()  # about the vertical in the map
-    T = gauge.T_m_c[300:400].copy()
-    T[:, :3, :3] = turn @ T[:, :3, :3]
-    other, _ = facing_along(motion.stamps_s[300:400], T)
-    D = Rotation.from_matrix(other @ R_w_m.T).as_rotvec()
-    assert D[2] == pytest.approx(-angle, abs=math.radians(1.5))
-    assert math.radians(2.9) < sigma < math.radians(4.0)
-    assert facing_along(motion.stamps_s[300:320], T[:20]) is None, "a second of frames"
-    assert facing_along(np.zeros(0), np.zeros((0, 4, 4))) is None
-
-
-def test_without_proof_nothing_tells_how_a_map_is_turned(rng, swinging, replay):
-    motion = swinging(24.0)
-    backwards = simulate(rng, motion.stamps_s, motion.T_w_c[::-1], T_B_C).samples()
-    fusion, gauge = MotionFusion(FusionConfig(delay_s=0.5), T_B_C), motion.in_gauge(rng)
-    replay(fusion, motion, gauge, backwards)
-    assert fusion.orientation.facing_along(motion.stamps_s, gauge.T_m_c) is None

@@ -5,14 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgeslam_torch.atlas.atlas import Join
-from edgeslam_torch.atlas.loops import Closure
-from edgeslam_torch.atlas.submap_heading import Turned, turn_about
-from edgeslam_torch.atlas.submap_scale import Rescaled, about
+from edgeslam_torch.atlas.atlas import MapChange
 from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.states.map_merging import MapMerging
-from edgeslam_torch.states.submap_uncertainty import SubmapUncertainty
 from edgeslam_torch.tracking.motion_model import MotionModel
 from edgeslam_torch.types import ScaleEstimate
 
@@ -29,8 +25,8 @@ class Pieces:
         self.queries = 0
         self.again = []
 
-    def piece_of(self, keyframe_id):
-        assert keyframe_id == KEYFRAME
+    @property
+    def present(self):
         return self.piece
 
     def pose_of(self, keyframe_id):
@@ -47,13 +43,13 @@ class Pieces:
             self.piece = 0
             if moved == 1:
                 self.T_k_w = sim3.moved_camera(S, self.T_k_w)
-            return Join(1.0, 0, 1, moved, S if moved == 1 else sim3.inverse(S), 0.01, 2, 300)
+            return MapChange("joined", 1.0, "piece 1 joined piece 0", {KEYFRAME: 1.5} if moved == 1 else {3: 1.5})
 
         return SimpleNamespace(
             update=update,
             search_all_again=lambda: None,
             search_again=lambda: self.again.append(self.piece),
-            align=lambda stamp_s, now: None,
+            correct_scale=lambda stamp_s, now: None,
             is_up_to_date=False,
             is_divided=True,
             known_scale={},
@@ -67,13 +63,13 @@ def system_of(pieces, motion, busy=False):
     fusion = SimpleNamespace(
         revise=lambda *poses: revised.append(poses),
         revised=revised,
+        scale=lambda: ScaleEstimate(2.0, 0.02, "telemetry"),
         metres=SimpleNamespace(remember=remembered.append, follow=lambda log: revised.append(pytest.approx(log))),
         remembered=remembered,
     )
     mapping = SimpleNamespace(busy=busy)
     again = lambda: revised.append("ratios")  # noqa: E731
     return SimpleNamespace(
-        submap_uncertainty=SubmapUncertainty(),
         compare_depths_again=again,
         log=log,
         map=pieces,
@@ -81,7 +77,7 @@ def system_of(pieces, motion, busy=False):
         fusion=fusion,
         mapping=mapping,
         published=OutputFrame(2.0),
-        scale_ratio=lambda: None,
+        graph=pieces,
         events={},
     )
 
@@ -120,66 +116,30 @@ def test_the_pose_stays_when_the_other_submap_is_moved(rng):
     np.testing.assert_allclose((motion.T_c_w, motion.predict(1.3)), before, atol=1e-12)
 
 
-def test_the_pose_is_transformed_by_a_loop_closure(rng):
-    """By the change of scale at its own keyframe."""
+@pytest.mark.parametrize("kind", ["loops_closed", "rescaled"])
+def test_the_pose_is_transformed_by_a_change_of_the_map(rng, kind):
+    """By the change of scale at its own keyframe; without new measurements only a rescaled map has another scale."""
     T_k_w, motion = moving(rng)
     p = rng.normal(size=(20, 3))
     before = se3.transform(motion.T_c_w, p)
     pieces = Pieces(T_k_w)
 
-    def update(stamp_s):
+    def change(*_):
         if pieces.queries:
             return None
         pieces.queries += 1
         pieces.T_k_w = sim3.moved_camera(S, T_k_w)
-        return Closure(1.0, 1, 30.0, 0.2, 0.1, 1.2, 2, 300, {KEYFRAME: 1.5, 3: 1.1})
+        return MapChange(kind, 1.0, "in words", {KEYFRAME: 1.5, 3: 1.1})
 
     system = system_of(pieces, motion)
-    words = MapMerging(system, SimpleNamespace(update=update, align=lambda *_: None, is_up_to_date=False)).update()
-    assert words.startswith("loop closed in piece 1, a place seen again after 30.0 s: 2 keyframes agree, 300 keypoints")
+    none = lambda *_: None  # noqa: E731
+    update, correct_scale = (change, none) if kind == "loops_closed" else (none, change)
+    atlas = SimpleNamespace(update=update, correct_scale=correct_scale, is_up_to_date=False)
+    assert MapMerging(system, atlas).update() == "in words"
     np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(S, p)), 1.5 * before, atol=1e-9)
-    assert (system.published.revision, system.events) == (1, {"loops_closed": 1})
-    assert system.fusion.revised == ["ratios", ("stamps", "poses")]
-
-
-def test_the_pose_is_transformed_when_its_submap_is_rescaled(rng):
-    T_k_w, motion = moving(rng)
-    p = rng.normal(size=(20, 3))
-    before = se3.transform(motion.T_c_w, p)
-    pieces = Pieces(T_k_w)
-    grown = about(np.array([1.0, -2.0, 0.5]), 1.3)
-
-    def rescale(stamp_s, now):
-        pieces.T_k_w = sim3.moved_camera(grown, T_k_w)
-        return Rescaled(7.0, 1, grown, 0.05)
-
-    system = system_of(pieces, motion)
-    atlas = SimpleNamespace(align=rescale, update=lambda _: None, is_up_to_date=False)
-    words = MapMerging(system, atlas).update()
-    assert words == "piece 1 scaled by 1.300 (sigma 5.0 %) to the previous metres"
-    np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(grown, p)), 1.3 * before, atol=1e-9)
-    assert (system.published.revision, system.events) == (1, {"rescaled": 1})
-    assert system.fusion.revised == [np.log(1.3), "ratios", ("stamps", "poses")], "the scale estimate is updated once"
-
-
-def test_the_pose_is_transformed_when_its_submap_is_rotated(rng):
-    T_k_w, motion = moving(rng)
-    p = rng.normal(size=(20, 3))
-    before = se3.transform(motion.T_c_w, p)
-    pieces = Pieces(T_k_w)
-    S = turn_about(np.array([1.0, -2.0, 0.5]), np.eye(3), 0.4)
-
-    def align(stamp_s, now):
-        pieces.T_k_w = sim3.moved_camera(S, T_k_w)
-        return Turned(7.0, 1, S, 0.4, 0.05)
-
-    system = system_of(pieces, motion)
-    system.submap_uncertainty.begin(1, 0, np.zeros(3), 0.0, 0.5)
-    atlas = SimpleNamespace(align=align, update=lambda _: None, is_up_to_date=False)
-    assert MapMerging(system, atlas).update() == "piece 1 rotated by 22.9 degrees (sigma 2.9) to the previous heading"
-    np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(S, p)), before, atol=1e-9)
-    assert (system.published.revision, system.events) == (1, {"turned": 1})
-    assert system.submap_uncertainty.sigma(1, np.array([2.0, 0.0, 0.0]), 0.0) == pytest.approx(0.1)
+    assert (system.published.revision, system.events) == (1, {kind: 1})
+    followed = [np.log(1.5)] if kind == "rescaled" else []
+    assert system.fusion.revised == [*followed, "ratios", ("stamps", "poses")]
 
 
 @pytest.mark.parametrize("finish", [False, True])

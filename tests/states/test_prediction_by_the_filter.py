@@ -5,9 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.states.drift import SHARE
 from edgeslam_torch.states.system import System
 from edgeslam_torch.tracking.motion_model import MotionModel
 
@@ -53,13 +51,8 @@ def test_a_correction_of_the_map_is_passed_to_the_fusion():
     refined = se3.exp(np.array([0.12, -0.01, 0.31, 0.01, 0.1, 0.02]))
     mapped = SimpleNamespace(keyframes=[SimpleNamespace(T_c_w=refined)], T_tracked=tracked, stage_ms={})
     keyframes.compare_depth = lambda keyframe: None
-    keyframes.map, keyframes.drift, keyframes.published = (
-        None,
-        SimpleNamespace(add=lambda *_: None, newest=3.0),
-        OutputFrame(2.0),
-    )
+    keyframes.graph = SimpleNamespace(add=lambda *_: None)
     System.absorb(keyframes, mapped)
     after = se3.inverse(keyframes.motion.T_c_w)
     assert np.linalg.norm(after - before) > 0.01
     np.testing.assert_allclose(moved[0] @ before, after, atol=1e-9)
-    assert keyframes.drift_sigma == pytest.approx(2.0 * 3.0 * SHARE)

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.atlas.saved import BEFORE_S
+from edgeslam_torch.atlas.submap_graph import SubmapGraph
 from edgeslam_torch.estimation.prediction import PoseEstimate
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.states.tracking import Tracking
+from edgeslam_torch.types import ScaleEstimate
 
 
 def placed(x):
@@ -45,16 +47,24 @@ class Flown:
             resolve=lambda k: (k, np.eye(4)),
             shared_counts=lambda anchors: self.sees_again if len(anchors) else {},
             piece_of=self.piece_of.__getitem__,
+            pose_of=lambda k: se3.inverse(placed(self.keyframes[k].centre_w[0])),
             anchors=SimpleNamespace(p_w=np.array([[0.0, 0.0, 2.0], [5.0, 0.0, 2.0]])),
         )
+        log = SimpleNamespace(
+            records=[SimpleNamespace(keyframe_id=0), SimpleNamespace(keyframe_id=5)],
+            replace=lambda *_: self.asked.append("moved"),
+            support=lambda: SimpleNamespace(piece=np.zeros(2), supported=np.ones(2, dtype=bool)),
+            poses=lambda: (np.zeros(2), np.stack([np.eye(4)] * 2)),
+        )
+        metres = ScaleEstimate(1.0, 0.02, "telemetry")
+        graph = SubmapGraph(slam_map, log, lambda: metres, lambda _: metres, lambda *_: metres)
+        graph.begin(1, self.keyframes[5], self.between, 0.0)
         return SimpleNamespace(
             map=slam_map,
+            graph=graph,
             tracker=SimpleNamespace(local_keyframes=lambda anchor: [self.keyframes[0]]),
-            log=SimpleNamespace(
-                records=[SimpleNamespace(keyframe_id=5)], replace=lambda *_: self.asked.append("moved")
-            ),
+            log=log,
             sensor_prediction=lambda stamp_s: self.predicted,
-            between=lambda piece, other: 0.0 if piece == other else self.between,
         )
 
     def finds(self, x, turned_deg=0.0):
@@ -76,7 +86,7 @@ def test_relocalisation_out_of_reach_is_rejected():
 
 @pytest.mark.parametrize(("x", "sigma", "may"), [(4.7, 0.01, True), (4.5, 0.01, False), (4.5, 0.1, True)])
 def test_the_gate_includes_drift_and_sensor_uncertainty(x, sigma, may):
-    """Three percent of the path, a tenth of the depth, and three sigmas: .38 and .65 units."""
+    """One percent of the path, three of the depth, and the sensors' sigma: .08 and .13 units per axis."""
     assert (Flown(sigma).finds(x) is not None) == may
 
 

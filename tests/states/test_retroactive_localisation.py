@@ -8,8 +8,7 @@ from point_map import CAMERA, SCALE_FACTOR, PointMap
 
 from edgeslam_torch.config import OrbConfig, TrackingConfig
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.states import retroactive_localisation
-from edgeslam_torch.states.retroactive_localisation import RetroactiveLocalisation
+from edgeslam_torch.states.retroactive_localisation import Frames, place_lost_frames
 from edgeslam_torch.tracking.tracker import Tracker, make_view
 from edgeslam_torch.types import FrameFeatures
 
@@ -25,9 +24,9 @@ class Lost:
         self.points.fill()
         self.keyframe = self.points.keyframes[VIEW]
         self.placed = {}
-        log = SimpleNamespace(replace=self._replace)
-        tracker = Tracker(self.points.map, CAMERA, OrbConfig(), TrackingConfig())
-        self.retroactive = RetroactiveLocalisation(SimpleNamespace(tracker=tracker, log=log))
+        self.log = SimpleNamespace(replace=self._replace)
+        self.tracker = Tracker(self.points.map, CAMERA, OrbConfig(), TrackingConfig())
+        self.frames = Frames(maxlen=6)
 
     def _replace(self, poses, keyframes):
         assert keyframes == [self.keyframe]
@@ -41,11 +40,12 @@ class Lost:
         descriptors = features.descriptors.copy()
         descriptors[strange] = self.rng.integers(0, 256, (strange.sum(), 32), dtype=np.uint8)
         features = FrameFeatures(features.uv, features.octave, features.angle_rad, descriptors)
-        self.retroactive.keep(index, make_view(features, SCALE_FACTOR))
+        self.frames.append((index, make_view(features, SCALE_FACTOR)))
 
     def place(self):
         held = self.keyframe.anchor[self.keyframe.anchor >= 0]
-        return self.retroactive.place(self.keyframe, self.points.world.T_c_w[VIEW], held)
+        T_c_w = self.points.world.T_c_w[VIEW]
+        return place_lost_frames(self.frames, self.tracker, self.log, self.keyframe, T_c_w, held)
 
 
 @pytest.fixture
@@ -70,11 +70,3 @@ def test_the_search_continues_after_one_failure_and_ends_after_two(lost, share):
         lost.keep(index, known)
     assert lost.place() == 2
     assert sorted(lost.placed) == [3, 5]
-
-
-def test_a_long_loss_keeps_its_newest_frames(lost, monkeypatch):
-    monkeypatch.setattr(retroactive_localisation, "MAX_FRAMES", 3)
-    for index in range(5):
-        lost.keep(index)
-    assert lost.place() == 3
-    assert sorted(lost.placed) == [2, 3, 4]

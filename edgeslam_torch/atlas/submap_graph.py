@@ -1,0 +1,265 @@
+"""The submap graph: what is known of the relative pose and scale of two places before images compare them.
+
+Nodes are submaps. A later submap begins at a predicted pose: that is a link to the one before, with the covariance of
+the drone's sensors, or none without them. Inside a submap the map drifts along covisible keyframes. Metres per map unit
+by sensors compare the scale of both places. Images add the links that merge submaps and close loops (`atlas/atlas.py`);
+they are believed if they agree with `SubmapGraph.between`.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from edgeslam_torch import gate
+from edgeslam_torch.atlas.saved import BEFORE_S
+from edgeslam_torch.geometry import se3, sim3
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.map.trajectory import TrajectoryLog
+from edgeslam_torch.types import FloatArray, ScaleEstimate
+
+DRIFT = 0.02
+"""Standard deviation of the map's drift per axis, as a share of the path; monocular maps drift by 1 to 3 %."""
+SENSOR_DRIFT = 0.01
+"""The same where the drone's sensors measure metres; on repetitive wallpaper the gate must stay below one period after
+tens of metres."""
+DRIFT_RAD = math.radians(4.7)
+"""Standard deviation of the drift of the rotation."""
+DRIFT_LOG = 0.02
+"""Standard deviation of the drift of the log scale between consecutive keyframes, a random walk."""
+PLACE = 0.03
+"""Standard deviation of a camera's place by images alone, relative to the depth."""
+PLACE_LOG = 0.07
+"""Standard deviation of the log scale of a view relative to its neighbourhood of seconds, for which sensors measure
+metres."""
+SURE_LOG = 0.1
+"""Maximum standard deviation of the log ratio of two scales for a correction."""
+MIN_SHARED = 15
+"""Common anchors from which on two keyframes are covisible, as in `SlamMap.covisible`."""
+NEIGHBOURS = 10
+"""Maximum number of graph edges from a keyframe to older covisible ones."""
+_MIN_DISTANCE = 1e-9
+"""Minimum length of a graph edge [map units]; a sparse graph takes 0 for a missing edge."""
+
+MetresAlong = Callable[[FloatArray, FloatArray], ScaleEstimate | None]
+"""Metres per map unit along frames by the drone's sensors, from stamps ``(F,)`` and poses ``(F, 4, 4)``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """Expected correction of a camera in the map of another place, with its standard deviations per axis."""
+
+    sigma_t: float
+    """[map units]"""
+    sigma_r_rad: float
+    log_scale: float = 0.0
+    sigma_log: float = math.inf
+
+    def allows(self, S: FloatArray, T_c_w: FloatArray) -> bool:
+        """Whether a similarity ``(4, 4)`` that images measured for a camera ``(4, 4)`` passes the gate."""
+        return self.allows_pose(T_c_w, sim3.moved_camera(S, T_c_w), math.log(sim3.scale_of(S)))
+
+    def allows_pose(self, T_c_w: FloatArray, measured: FloatArray, log_scale: float | None = None) -> bool:
+        """The same of an expected and a measured pose ``(4, 4)``, and of a log scale if one was measured."""
+        off = T_c_w @ se3.inverse(measured)
+        scale, sigma_log = (0.0, math.inf) if log_scale is None else (log_scale - self.log_scale, self.sigma_log)
+        residual = np.concatenate([off[:3, 3], se3.log(off)[3:], [scale]])
+        sigma = np.repeat([self.sigma_t, self.sigma_r_rad, sigma_log], [3, 3, 1])
+        return gate.passes(residual, np.diag(sigma**2))
+
+    def plus(self, sigma_t: float, sigma_r_rad: float) -> "Belief":
+        """With independent errors of the pose added."""
+        return Belief(
+            math.hypot(self.sigma_t, sigma_t), math.hypot(self.sigma_r_rad, sigma_r_rad), self.log_scale, self.sigma_log
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """Link by sensors from a submap to the first one, at the keyframe where it begins."""
+
+    keyframe_id: int
+    sigma_t: float
+    """Standard deviation of its centre per axis [map units]."""
+    sigma_r_rad: float
+
+
+@dataclass(slots=True)
+class SubmapGraph:
+    """Links by sensors between the submaps of a flight, and drift inside them."""
+
+    map: SlamMap
+    log: TrajectoryLog
+    scale_now: Callable[[], ScaleEstimate] = ScaleEstimate
+    """Present metres per map unit."""
+    metres_around: Callable[[float], ScaleEstimate | None] = lambda _: None
+    """Metres per map unit by sensors around the stamp of an earlier frame."""
+    metres_along: MetresAlong = lambda *_: None
+    starts: dict[int, _Start] = field(default_factory=dict)
+    """By the number of the submap."""
+    first_scale: ScaleEstimate = field(default_factory=ScaleEstimate)
+    """Metres per map unit of the first submap, as estimated when the camera left it."""
+    _path: dict[int, float] = field(default_factory=dict)
+    """Length of the shortest covisibility path [map units] from the first keyframe to others, by their ids."""
+    drift: float = 0.0
+    """Standard deviation per axis [map units] of the newest keyframe's drift since the first one."""
+
+    def begin(self, piece: int, keyframe: Keyframe, sigma_t: float, sigma_r_rad: float) -> None:
+        """Add a submap that begins at a keyframe in the map, at a pose predicted with standard deviations per axis
+        from the previous submap; infinite ones without sensors."""
+        before = next((p for r in reversed(self.log.records) if (p := self.map.piece_of(r.keyframe_id)) != piece), None)
+        if before is None:
+            return
+        if before not in self.starts:
+            self.first_scale = self.scale_now()
+        earlier_t, earlier_r = self.apart(before, self.first, keyframe.centre_w)
+        sigma = math.hypot(sigma_t, earlier_t), math.hypot(sigma_r_rad, earlier_r)
+        self.starts[piece] = _Start(keyframe.id, *sigma)
+
+    @property
+    def first(self) -> int:
+        """Number of the submap in which the flight began."""
+        return self.map.piece_of(self.log.records[0].keyframe_id)
+
+    @property
+    def present(self) -> int:
+        """Number of the submap of the newest frame."""
+        return self.map.piece_of(self.log.records[-1].keyframe_id)
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Update the drift with a mapped keyframe: a revisit makes its path short again."""
+        near = [k for k in self.map.covisible(keyframe, NEIGHBOURS) if k.id in self._path]
+        paths = [self._path[k.id] + float(np.linalg.norm(k.centre_w - keyframe.centre_w)) for k in near]
+        self._path[keyframe.id] = min(paths, default=self.drift / DRIFT)
+        self.drift = DRIFT * self._path[keyframe.id]
+
+    def follow(self, scale_change: dict[int, float]) -> None:
+        """Update the first scale after keyframes were moved, by the change of scale at each of them."""
+        grown = scale_change.get(self.log.records[0].keyframe_id, 1.0) if self.log.records else 1.0
+        first = self.first_scale
+        self.first_scale = replace(first, value=first.value / grown, sigma=first.sigma / grown)
+
+    # -- marginals ---------------------------------------------------------------------------------------------
+
+    def apart(self, piece: int, other: int, centre: FloatArray) -> tuple[float, float]:
+        """Standard deviations per axis [map units, rad] of a camera ``(3,)`` of one submap as seen from another, by
+        the sensors' links; infinite if unrelated, as submaps of earlier flights.
+
+        Errors of rotation and of both scales grow with the distance from where a submap begins.
+        """
+        variance = np.zeros(2)
+        scale = self.scale_now()
+        for submap in {piece, other} - {self.first} if piece != other else ():
+            start = self.starts.get(submap)
+            if start is None:
+                return math.inf, math.inf
+            way = float(np.linalg.norm(centre - se3.inverse(self.map.pose_of(start.keyframe_id))[:3, 3]))
+            lever = way * math.hypot(start.sigma_r_rad, math.sqrt(2.0) * scale.sigma / scale.value) if way else 0.0
+            variance += start.sigma_t**2 + lever**2, start.sigma_r_rad**2
+        return math.sqrt(variance[0]), math.sqrt(variance[1])
+
+    def between(self, one: Keyframe, other: Keyframe, depth: float) -> Belief | None:
+        """Correction to be expected of a keyframe's pose in the map of another; None if nothing relates them.
+
+        Args:
+            one: In the map.
+            other: Likewise.
+            depth: Median depth of what is seen [map units].
+        """
+        pieces = [self.map.piece_of(k.id) for k in (one, other)]
+        one_map = pieces[0] == pieces[1]
+        if not one_map and BEFORE_S in (one.stamp_s, other.stamp_s):
+            return None
+        sigma_t, sigma_r = self.apart(*pieces, one.centre_w)
+        if not math.isfinite(sigma_t):
+            return None
+        drift, steps = self._drift(one, other)
+        sigma_t, sigma_r = math.hypot(sigma_t, drift, PLACE * depth), math.hypot(sigma_r, DRIFT_RAD)
+        if not one_map:
+            return Belief(sigma_t, sigma_r)
+        here, there = (self.metres_around(k.stamp_s) for k in (one, other))
+        if here is None or there is None:
+            return Belief(sigma_t, sigma_r, 0.0, DRIFT_LOG * math.sqrt(steps))
+        ratio, sigma_log = _ratio(here, there)
+        return Belief(sigma_t, sigma_r, math.log(ratio), math.hypot(sigma_log, PLACE_LOG))
+
+    def _drift(self, one: Keyframe, other: Keyframe) -> tuple[float, int]:
+        """Standard deviation of the drift per axis along the path between two keyframes with the least of it, over
+        consecutive and covisible ones, and its number of steps.
+
+        A covisible edge counts the keyframes that it skips; a loop closure counts as `NEIGHBOURS` at most. The scale of
+        a submap that is not merged with the oldest one may be wrong for a while, also with sensors.
+        """
+        members = [k for _, k in sorted(self.map.keyframes.items())]
+        row_of = {k.id: row for row, k in enumerate(members)}
+        oldest = min(self.map.piece_of(one.id), self.map.piece_of(other.id))
+        held = SENSOR_DRIFT if self.metres(oldest) is not None else DRIFT
+        share = np.array([held if self.map.piece_of(k.id) == oldest else DRIFT for k in members])
+        centre = np.stack([k.centre_w for k in members])
+        i, j = np.array(list(shared_anchors(self.map, members)), dtype=np.int64).reshape(-1, 2).T
+        edge = np.linalg.norm(centre[i] - centre[j], axis=1) * share[i] + _MIN_DISTANCE
+        ways = csr_array((edge, (i, j)), shape=(len(members), len(members)))
+        here, at = row_of[one.id], row_of[other.id]
+        drift, before = dijkstra(ways, directed=False, indices=here, return_predecessors=True)
+        sigma, steps = float(drift[at]), 1
+        while at != here:
+            steps, at = steps + min(abs(at - int(before[at])), NEIGHBOURS), int(before[at])
+        return sigma, steps
+
+    # -- scale -------------------------------------------------------------------------------------------------
+
+    def metres(self, piece: int) -> ScaleEstimate | None:
+        """Metres per map unit along the frames that a submap supports, by the drone's sensors."""
+        support = self.log.support()
+        use = (support.piece == piece) & support.supported
+        stamps_s, T_w_c = self.log.poses()
+        return self.metres_along(stamps_s[use], T_w_c[use])
+
+    def scale_between(self, piece: int, other: int) -> tuple[float, float] | None:
+        """Scale of another submap relative to a submap by sensors, and the standard deviation of its logarithm."""
+        here, there = self.metres(piece), self.metres(other)
+        return None if here is None or there is None else _ratio(here, there)
+
+    @property
+    def keeps_scale(self) -> bool:
+        """Whether the camera is in a later submap of significantly another scale than the first one: that corrects the
+        submap (`wrong_scale`) and not the output, which is in the first one's scale."""
+        return self.present in self.starts and _is_other(*_ratio(self.scale_now(), self.first_scale))
+
+    def wrong_scale(self, now: ScaleEstimate | None) -> float | None:
+        """Factor by which the camera's submap must be scaled to the flight's first one; None unless significant.
+
+        Args:
+            now: Present metres per map unit. All frames of the submap count more, but velocities may be missing there.
+        """
+        along = self.scale_between(self.present, self.first)
+        present = _ratio(now, self.first_scale) if now is not None and self.present in self.starts else None
+        return next((ratio[0] for ratio in (along, present) if ratio is not None and _is_other(*ratio)), None)
+
+
+def _is_other(ratio: float, sigma_log: float) -> bool:
+    """Whether a ratio of two scales is known, and significantly other than 1."""
+    return sigma_log <= SURE_LOG and not gate.passes(np.array([math.log(ratio)]), np.array([[sigma_log**2]]))
+
+
+def _ratio(here: ScaleEstimate, there: ScaleEstimate) -> tuple[float, float]:
+    """Ratio of two scales, and the standard deviation of its logarithm."""
+    return here.value / there.value, math.hypot(here.sigma / here.value, there.sigma / there.value)
+
+
+def shared_anchors(slam_map: SlamMap, members: list[Keyframe]) -> dict[tuple[int, int], int]:
+    """Number of common anchors of pairs of keyframes, by rows, newer one first: best pairs, and consecutive ones."""
+    row_of = {k.id: row for row, k in enumerate(members)}
+    pairs: dict[tuple[int, int], int] = {}
+    for row, keyframe in enumerate(members):
+        counts = slam_map.shared_counts(keyframe.anchor[keyframe.anchor >= 0])
+        older = {row_of[id]: n for id, n in counts.items() if row_of.get(id, row) < row}
+        best = sorted((r for r in older if older[r] >= MIN_SHARED), key=lambda r: (-older[r], -r))[:NEIGHBOURS]
+        pairs |= {(row, r): older[r] for r in best}
+        if row > 0:
+            pairs[row, row - 1] = older.get(row - 1, 0)
+    return pairs
