@@ -157,7 +157,9 @@ class SubmapGraph:
             start = self.starts.get(submap)
             if start is None:
                 return math.inf, math.inf
-            way = float(np.linalg.norm(centre - se3.inverse(self.map.pose_of(start.keyframe_id))[:3, 3]))
+            with self.map.lock:
+                began = se3.inverse(self.map.pose_of(start.keyframe_id))[:3, 3]
+            way = float(np.linalg.norm(centre - began))
             lever = way * math.hypot(start.sigma_r_rad, math.sqrt(2.0) * scale.sigma / scale.value) if way else 0.0
             variance += start.sigma_t**2 + lever**2, start.sigma_r_rad**2
         return math.sqrt(variance[0]), math.sqrt(variance[1])

@@ -1,6 +1,7 @@
 """What the submap graph says of two places before images compare them."""
 
 import math
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,6 +24,7 @@ class World:
         self.keyframes = [SimpleNamespace(id=k, centre_w=np.array([at, 0.0, 0.0])) for k, at in enumerate(x)]
         self.frames = [SimpleNamespace(keyframe_id=k) for k in range(len(x))]
         self.records = self.frames[:1]
+        self.lock = nullcontext()
 
     def support(self):
         return SimpleNamespace(piece=np.array([self.piece[r.keyframe_id] for r in self.records]), supported=True)
