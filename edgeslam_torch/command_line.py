@@ -145,7 +145,7 @@ def _unknown_arguments(unknown: list[str], options: list[str]) -> str:
     if not word.startswith("-"):
         return f"unexpected {word!r}"
     option = word.split("=", 1)[0]
-    close = difflib.get_close_matches(option, options, n=1, cutoff=0.5)
+    close = [o for o in options if o.startswith(option)] or difflib.get_close_matches(option, options, 1, 0.5)
     return f"no option {option!r}" + (f"; did you mean {close[0]!r}?" if close else "")
 
 

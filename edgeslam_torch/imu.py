@@ -36,16 +36,14 @@ class ImuReadings(Record):
     def __post_init__(self) -> None:
         for name in ("stamps_s", "angular_rate_rad_s", "acceleration_m_s2"):
             object.__setattr__(self, name, np.array(getattr(self, name), dtype=np.float64))
-        n = len(self.stamps_s) if self.stamps_s.ndim == 1 else -1
-        if self.angular_rate_rad_s.shape != (n, 3) or self.acceleration_m_s2.shape != (n, 3):
-            shapes = self.stamps_s.shape, self.angular_rate_rad_s.shape, self.acceleration_m_s2.shape
+        shapes = self.stamps_s.shape, self.angular_rate_rad_s.shape, self.acceleration_m_s2.shape
+        if shapes != ((n := self.stamps_s.size,), (n, 3), (n, 3)):
             raise ValueError(f"IMU readings are (N,), (N, 3), (N, 3), got {', '.join(map(str, shapes))}")
         if not np.isfinite(self.stamps_s).all() or not (self.stamps_s[1:] > self.stamps_s[:-1]).all():
             raise ValueError("stamps of IMU readings are finite and strictly increasing")
-        if not np.isfinite(self.acceleration_m_s2).all():
-            raise ValueError("accelerations of IMU readings are finite")
-        if self.has_gyroscope and not np.isfinite(self.angular_rate_rad_s).all():
-            raise ValueError("angular rates of IMU readings are finite, or all NaN without a gyroscope")
+        used = [self.acceleration_m_s2, *([self.angular_rate_rad_s] if self.has_gyroscope else [])]
+        if not all(np.isfinite(values).all() for values in used):
+            raise ValueError("IMU readings are finite; without a gyroscope all angular rates are NaN")
 
     def __len__(self) -> int:
         return len(self.stamps_s)
@@ -144,11 +142,9 @@ def check_readings(readings: Sequence[Reading]) -> None:
     if not isinstance(readings, Sequence):
         raise TypeError(f"readings are a list of TelemetrySample and ImuReadings, got {type(readings).__name__}")
     for reading in readings:
-        if isinstance(reading, ImuReadings):
-            continue
-        if not isinstance(reading, TelemetrySample):
+        if not isinstance(reading, Reading):
             raise TypeError(f"readings: a TelemetrySample or ImuReadings is expected, got {type(reading).__name__}")
-        for name in ("velocity_m_s", "rpy_rad", "acceleration_m_s2"):
+        for name in ("velocity_m_s", "rpy_rad", "acceleration_m_s2") if isinstance(reading, TelemetrySample) else ():
             if not isinstance(value := getattr(reading, name), np.ndarray) or value.shape != (3,):
                 raise ValueError(f"telemetry: {name} is an array of 3 numbers, got {np.shape(value)}")
 

@@ -26,7 +26,7 @@ from edgeslam_torch.help.examples import EXAMPLES, GROUPS
 @pytest.fixture
 def edgeslam(monkeypatch, capsys):
     """Run a command line with the fake system: returns exit code, stdout, stderr."""
-    monkeypatch.setattr(edgeslam_torch.run, "_edge_slam", lambda camera, config, realtime: FakeSlam())
+    monkeypatch.setattr(edgeslam_torch.run, "_edge_slam", lambda camera, config, realtime, imu: FakeSlam())
 
     def call(*words):
         try:
@@ -297,7 +297,7 @@ fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 import edgeslam_torch.run
 from edgeslam_torch.cli import main
 from fake_slam import FakeSlam
-edgeslam_torch.run._edge_slam = lambda camera, config, realtime: FakeSlam()
+edgeslam_torch.run._edge_slam = lambda camera, config, realtime, imu: FakeSlam()
 sys.exit(main())
 """
 

@@ -105,6 +105,7 @@ def summarise(
         "stage_mean_ms_per_frame": {stage: sum(ms) / tally.frames for stage, ms in tally.stage_ms.items()},
         "scale": {"value": scale.value, "sigma": scale.sigma, "source": scale.source, "units": str(scale.units)},
         "telemetry_samples": len(source.telemetry),
+        "imu_readings": 0 if source.imu_readings is None else len(source.imu_readings),
         "problems": [{"file": problem.file, "reason": problem.reason} for problem in source.problems[:MAX_PROBLEMS]],
     }
 
