@@ -87,9 +87,6 @@ def run_ablation(
     wanted |= {ROWS[name].against for name in wanted} | {DEFAULT}
     rows = {name: (row.set, row.first) for name, row in ROWS.items() if name in wanted}
     records = run_rows(settings, rows, out, say)
-    for run in (run for record in records.values() for run in record["runs"]):
-        figures = run["figures"]
-        run["figures"] = {c.name: figures.get("coverage" if c.name == "supported" else c.name) for c in COLUMNS}
     record = {
         "version": __version__,
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -99,10 +96,18 @@ def run_ablation(
             "max_frames": settings.max_frames,
             "overrides": list(settings.overrides),
         },
-        "rows": {name: records.get(name, {"runs": []}) for name in ROWS},
+        "rows": {
+            name: {"runs": [_kept(run) for run in records[name]["runs"]] if name in records else []} for name in ROWS
+        },
     }
     write_text(out / "ablation.json", json.dumps(record, indent=1) + "\n")
     return record
+
+
+def _kept(run: dict[str, Any]) -> dict[str, Any]:
+    """What the record has of a run."""
+    figures = {c.name: run["figures"].get("coverage" if c.name == "supported" else c.name) for c in COLUMNS}
+    return {"sequence": run["sequence"], "seed": run["seed"], "figures": figures, "error": run["error"]}
 
 
 def markdown_ablation(record: dict[str, Any]) -> str:

@@ -27,7 +27,7 @@ from edgeslam_torch.train import (
     out_folder,
     train,
 )
-from edgeslam_torch.train.finetuning import settings_of
+from edgeslam_torch.train.recipes.finetune import settings_of
 
 METADATA = Metadata(input_height=32, input_width=64, focal_px=50.0)
 VIEW = View(

@@ -19,8 +19,8 @@ from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
 from edgeslam_torch.models.device import DEVICES
 from edgeslam_torch.models.trainable import DepthModule
-from edgeslam_torch.train.default_weights import Progress, validation_of
 from edgeslam_torch.train.recipe import FINAL, TrainConfig, train
+from edgeslam_torch.train.recipes.default_weights import Progress, Scores
 from edgeslam_torch.train.recipes.rendered_views import render_files
 from edgeslam_torch.train.signals import Source, Supervised, SupervisedWeights
 from edgeslam_torch.train.views.augment import AugmentConfig
@@ -81,7 +81,7 @@ def teach_places(
         for name, share in shares.items()
     ]
     watched = {name: load_depth_folder(data / name, 480, stride=12).views for name in watch}
-    validate = validation_of(metadata, {PLACES: stored_views(first), **watched})
+    validate = Scores(metadata, {PLACES: stored_views(first), **watched})
     train(network, metadata, [Supervised(sources, metadata, AUGMENT, WEIGHTS)], config, out, validate, [Progress()])
     before, after = load_checkpoint(start)[0], load_checkpoint(out / FINAL)[0]
     before.load_state_dict(mean_of(before, after, MEAN_SHARE))

@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +17,11 @@ from edgeslam_torch.errors import ConfigError, SourceError
 from edgeslam_torch.files.plain import subfolder
 
 if TYPE_CHECKING:
+    from edgeslam_torch.models.record import Metadata
+    from edgeslam_torch.models.trainable import DepthModule
     from edgeslam_torch.train.folder import OutFolder
-    from edgeslam_torch.train.recipe import TrainConfig
+    from edgeslam_torch.train.recipe import Hooks, TrainConfig
+    from edgeslam_torch.train.recipes.finetune import FromRuns
     from edgeslam_torch.train.result import TrainingResult
     from edgeslam_torch.train.teachers.cache import TeacherCache
     from edgeslam_torch.train.views.datasets import DepthFolder
@@ -152,6 +155,52 @@ def train_config(args: argparse.Namespace, lr: float, frozen_stages: int, freeze
         )
     except ValueError as error:
         raise ConfigError(f"--{error}") from error
+
+
+def say(text: str) -> None:
+    """One line, in the first process."""
+    from edgeslam_torch.train.processes.distributed import rank
+
+    if rank() == 0:
+        print(text, flush=True)
+
+
+def check_folder(
+    args: argparse.Namespace,
+    out: "OutFolder",
+    start: "tuple[DepthModule, Metadata]",
+    sets: Sequence[tuple[str, str]],
+    config: "TrainConfig",
+    reading: Mapping[str, object],
+    hooks: "Sequence[Hooks]",
+    from_runs: "FromRuns | None" = None,
+) -> None:
+    """Check whether training may begin or resume in ``out``, before anything is read.
+
+    Args:
+        args: The shared ones.
+        out: Folder of the training.
+        start: Network and metadata to begin with.
+        sets: Name and kind of every data set.
+        config: Of the recipe.
+        reading: How the data is read.
+        hooks: The user's.
+        from_runs: What is learnt from images without labels.
+
+    Raises:
+        ConfigError, OutputError: If it holds another training, or something else.
+    """
+    from edgeslam_torch.train.inputs import DataSet, Inputs, weights_name
+    from edgeslam_torch.train.processes.distributed import by_first
+    from edgeslam_torch.train.recipes.finetune import FromRuns, settings_of
+
+    expected = Inputs(
+        weights_name(*start),
+        tuple(DataSet(name, kind) for name, kind in sets),
+        tuple(DataSet(os.path.basename(os.path.abspath(path)), "depth") for path in args.validate),
+        settings_of(config, from_runs or FromRuns.TEACHER, reading, hooks),
+    )
+    by_first(lambda: out.check(expected))
 
 
 def in_folder(args: argparse.Namespace, work: "Callable[[OutFolder], TrainingResult]") -> int:

@@ -1,29 +1,29 @@
 """``edgeslam distil``: distil a larger depth network into FastDepth."""
 
 import argparse
-import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.commands.training._inputs import (
     Item,
     add_shared_arguments,
+    check_folder,
     check_shared,
     in_folder,
     items_of,
     posed_run,
+    say,
     teacher_cache,
     train_config,
     validation_folders,
 )
 from edgeslam_torch.errors import ConfigError
-from edgeslam_torch.files.plain import subfolder
 
 if TYPE_CHECKING:
     from edgeslam_torch.frontend.depth_network import DepthNetwork
     from edgeslam_torch.models.fastdepth import FastDepth
     from edgeslam_torch.models.record import Metadata
-    from edgeslam_torch.train.finetuning import Data
     from edgeslam_torch.train.folder import OutFolder
     from edgeslam_torch.train.recipe import Hooks, TrainConfig
     from edgeslam_torch.train.result import TrainingResult
@@ -72,7 +72,7 @@ def _student(name: str) -> "tuple[FastDepth, Metadata, bool]":
     from edgeslam_torch.models.checkpoint import load_checkpoint
     from edgeslam_torch.models.layout import Variant
     from edgeslam_torch.models.record import Metadata
-    from edgeslam_torch.train.teachers.distil import new_student
+    from edgeslam_torch.train.recipes.distil import new_student
 
     if name in [*Variant]:
         network, metadata = new_student(Variant(name))
@@ -99,47 +99,11 @@ def _distil(
     out: "OutFolder",
 ) -> "TrainingResult":
     from edgeslam_torch.models.checkpoint import file_hash
-    from edgeslam_torch.train.finetuning import FromRuns, finetune, settings_of
-    from edgeslam_torch.train.inputs import DataSet, Inputs, weights_name
-    from edgeslam_torch.train.processes.distributed import by_first, rank
+    from edgeslam_torch.train.recipes.distil import distil
 
-    sha256 = file_hash(teacher.weights)
-    reading = {"teacher": f"{teacher.weights.name} {sha256[:12]}", "max_frames": args.max_frames, "camera": args.camera}
-    expected = Inputs(
-        weights_name(student, metadata),
-        tuple(DataSet(item.name, "depth") for item in items),
-        tuple(DataSet(os.path.basename(os.path.abspath(path)), "depth") for path in args.validate),
-        settings_of(config, FromRuns.TEACHER, reading, hooks),
-    )
-    by_first(lambda: out.check(expected))  # fail before running SLAM
-    data = _labelled(args, items, teacher, sha256, out)
-    if rank() == 0:
-        for line in data.describe():
-            print(line, flush=True)
-    return finetune(student, metadata, data, config, out, reading=reading, hooks=hooks, calibrate=True)
-
-
-def _labelled(
-    args: argparse.Namespace, items: list[Item], teacher: "DepthNetwork", sha256: str, out: "OutFolder"
-) -> "Data":
-    """The recordings with the teacher's depth; metres are the teacher's, or the run's where it has none."""
-    from edgeslam_torch.train.finetuning import Data
-    from edgeslam_torch.train.inputs import posed_set
-    from edgeslam_torch.train.processes.distributed import rank
-    from edgeslam_torch.train.teachers.distil import label
-
-    cache = teacher_cache(args)
-    data = Data(validation=validation_folders(args.validate))
-    for number, item in enumerate(items):
-        run = posed_run(item, out, args.camera, args.max_frames)
-        if not (teacher.is_metric or run.metric):
-            raise ConfigError(f"{item.path}: neither the teacher nor the run gives metres; add telemetry to it")
-        scale = None if teacher.is_metric else 0.0
-        folder = subfolder(out.path, "labels") / f"{number}-{item.name}-{sha256[:12]}"
-        if cache is not None:
-            folder = cache.entry(item.name, str(posed_set(run).sha256), sha256, repr(scale))
-        labels = label(teacher, run, scale, folder)
-        data.labelled.append(labels.folder)
-        if rank() == 0:
-            print(labels.describe(), flush=True)
-    return data
+    name = f"{teacher.weights.name} {file_hash(teacher.weights)[:12]}"
+    reading = {"teacher": name, "max_frames": args.max_frames, "camera": args.camera}
+    check_folder(args, out, (student, metadata), [(item.name, "depth") for item in items], config, reading, hooks)
+    cache, validation = teacher_cache(args), validation_folders(args.validate)
+    runs = (replace(posed_run(item, out, args.camera, args.max_frames), name=item.name) for item in items)
+    return distil(student, metadata, teacher, runs, config, out, validation, reading, hooks, cache, say)

@@ -2,17 +2,18 @@
 
 import argparse
 import logging
-import os
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.commands.training._inputs import (
     Item,
     add_shared_arguments,
+    check_folder,
     check_shared,
     in_folder,
     items_of,
     labelled_folder,
     posed_run,
+    say,
     teacher_cache,
     train_config,
     validation_folders,
@@ -23,9 +24,9 @@ from edgeslam_torch.models.record import weights_file
 if TYPE_CHECKING:
     from edgeslam_torch.models.fastdepth import FastDepth
     from edgeslam_torch.models.record import Metadata
-    from edgeslam_torch.train.finetuning import Data
     from edgeslam_torch.train.folder import OutFolder
     from edgeslam_torch.train.recipe import Hooks, TrainConfig
+    from edgeslam_torch.train.recipes.finetune import Data
     from edgeslam_torch.train.result import TrainingResult
 
 logger = logging.getLogger(__name__)
@@ -79,33 +80,25 @@ def _finetune(
     hooks: "list[Hooks]",
     out: "OutFolder",
 ) -> "TrainingResult":
-    from edgeslam_torch.train.finetuning import FromRuns, finetune, settings_of
-    from edgeslam_torch.train.inputs import DataSet, Inputs, weights_name
-    from edgeslam_torch.train.processes.distributed import by_first, rank
+    from edgeslam_torch.train.recipes.finetune import FromRuns, finetune
 
     from_runs = FromRuns(args.from_runs)
     reading = {name: getattr(args, name) for name in ("ignore_depth", "max_frames", "camera")}
-    expected = Inputs(
-        weights_name(network, metadata),
-        tuple(DataSet(item.name, "depth" if item.kind == "depth" else "run") for item in items),
-        tuple(DataSet(os.path.basename(os.path.abspath(path)), "depth") for path in args.validate),
-        settings_of(config, from_runs, reading, hooks),
-    )
-    by_first(lambda: out.check(expected))  # fail before running SLAM
+    sets = [(item.name, "depth" if item.kind == "depth" else "run") for item in items]
+    check_folder(args, out, (network, metadata), sets, config, reading, hooks, from_runs)
     if args.weights is not None and out.holds(args.weights):
         raise ConfigError(f"{args.weights}: would be overwritten by its own fine-tuning; give another --out")
     data = _data(args, items, out)
-    if rank() == 0:
-        for line in data.describe():
-            print(line, flush=True)
-        if not args.overwrite and 0 < (step := out.step) < args.steps:
-            print(f"{out.path}: goes on after step {step}", flush=True)
+    for line in data.describe():
+        say(line)
+    if not args.overwrite and 0 < (step := out.step) < args.steps:
+        say(f"{out.path}: goes on after step {step}")
     return finetune(network, metadata, data, config, out, from_runs, reading, hooks, teacher_cache(args))
 
 
 def _data(args: argparse.Namespace, items: list[Item], out: "OutFolder") -> "Data":
     """Read the folders; SLAM is run on recordings without labels first."""
-    from edgeslam_torch.train.finetuning import Data
+    from edgeslam_torch.train.recipes.finetune import Data
     from edgeslam_torch.train.views.posed import TooFewViews
 
     data = Data(validation=validation_folders(args.validate))

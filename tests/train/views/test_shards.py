@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.train.finetuning import HELD_OUT, MOST_HELD_OUT, _split
 from edgeslam_torch.train.inputs import labelled_set
+from edgeslam_torch.train.recipes.finetune import HELD_OUT, MOST_HELD_OUT, _split
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.shards import is_sharded, load_shards, write_shards

@@ -19,8 +19,8 @@ from edgeslam_torch.models.onnx.graph import build_graph
 from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.train.calibrate_sigma import coverage, residuals_and_sigma
+from edgeslam_torch.train.recipes.distil import brought_to_map, label, log_metres, new_student
 from edgeslam_torch.train.teachers import teach
-from edgeslam_torch.train.teachers.distil import brought_to_map, label, log_metres, new_student
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView, load_run
 from edgeslam_torch.types import DepthMap, FloatArray

@@ -17,7 +17,7 @@ from edgeslam_torch.errors import OutputError, SourceError
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Widths
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.finetuning import Data
+from edgeslam_torch.train.recipes.finetune import Data
 from edgeslam_torch.train.teachers import teach as teacher
 from edgeslam_torch.train.views import posed, slam_runs
 from edgeslam_torch.train.views.posed import PosedSequence, load_run

@@ -1,4 +1,4 @@
-"""The recipe of the shipped weights: ``python -m edgeslam_torch.train.default_weights --data DIR --out DIR``.
+"""The recipe of the shipped weights: ``python -m edgeslam_torch.train.recipes.default_weights --data DIR --out DIR``.
 
 1. Encoder from ImageNet; recordings and rendered rooms mixed, at a constant rate.
 2. Fewer rendered rooms and gentler augmentation, the rate falling to nothing.
@@ -101,16 +101,14 @@ class Progress(Hooks):
         logger.info("step %d: %s", state.step, " ".join(f"{k} {v:.4f}" for k, v in metrics.items()))
 
 
-def validation_of(metadata: Metadata, sets: dict[str, Sequence[View]]) -> "_Validation":
-    """Scores on named sets; the first one decides."""
-    return _Validation(metadata, sets)
+class Scores:
+    """Of a network on named sets; the first one decides."""
 
-
-class _Validation:
     def __init__(self, metadata: Metadata, sets: dict[str, Sequence[View]]) -> None:
         self.metadata, self.sets, self.start = metadata, sets, time.monotonic()
 
     def __call__(self, network: DepthModule) -> dict[str, float]:
+        """As `train` takes it."""
         metrics: dict[str, float] = {}
         for name, views in self.sets.items():
             for key, value in dataclasses.asdict(score(network, self.metadata, views)).items():
@@ -150,7 +148,7 @@ def make_default_weights(data: Path, out: Path, recipe: Recipe, watch: Sequence[
     pools: dict[str, Sequence[View]] = {name: load_depth_folder(data / name).views for name in REAL}
     pools[RENDERED] = rendered
     watched = {name: load_depth_folder(data / name, 640, stride=6).views for name in watch}
-    validate = validation_of(metadata, {RENDERED: held_out, **watched})
+    validate = Scores(metadata, {RENDERED: held_out, **watched})
     network = build_network(metadata)
     load_imagenet_encoder(network, data / IMAGENET)
     _phase(network, metadata, pools, broad, recipe.broad, recipe.broad_augment, out / "broad", validate)
@@ -170,7 +168,7 @@ def _phase(
     config: TrainConfig,
     augment: AugmentConfig,
     out: Path,
-    validate: _Validation,
+    validate: Scores,
 ) -> None:
     if (out / "final.safetensors").is_file():
         logger.info("%s is there already", out / "final.safetensors")

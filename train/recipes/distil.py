@@ -1,29 +1,40 @@
 """Distil a larger depth network into FastDepth on recordings without labels.
 
-Each recording gets poses and a map by the SLAM. The teacher's depth is brought to that map view by view, by scale (or
-scale and shift, when it is relative) and smoothly near measured pixels; where the plane sweep measures depth, that
-counts instead (`teach`). The result trains the student like any images with depth.
+1. Each recording has poses and a map by the SLAM (`posed`).
+2. The teacher's depth is brought to that map view by view, by scale (or scale and shift, when it is relative) and
+   smoothly near measured pixels; where the plane sweep measures depth, that counts instead (`label`).
+3. The student learns from that as from any images with depth (`finetune`), and its uncertainty is calibrated.
 """
 
 import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import torch
 from torch import nn
 
-from edgeslam_torch.errors import SourceError
+from edgeslam_torch.errors import ConfigError, SourceError
+from edgeslam_torch.files.plain import subfolder
 from edgeslam_torch.frontend.depth_check import usable
 from edgeslam_torch.frontend.depth_network import DepthNetwork
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.depth_prior import fit_to_anchors
 from edgeslam_torch.map.relative_depth import fit_inverse
-from edgeslam_torch.models.checkpoint import build_network, load_checkpoint
+from edgeslam_torch.models.checkpoint import build_network, file_hash, load_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.layout import Variant
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.processes.distributed import world
+from edgeslam_torch.models.trainable import DepthModule
+from edgeslam_torch.train.folder import OutFolder
+from edgeslam_torch.train.inputs import posed_set
+from edgeslam_torch.train.processes.distributed import rank, world
+from edgeslam_torch.train.recipe import Hooks, TrainConfig
+from edgeslam_torch.train.recipes.finetune import Data, finetune
+from edgeslam_torch.train.result import TrainingResult
+from edgeslam_torch.train.teachers.cache import TeacherCache
 from edgeslam_torch.train.teachers.teach import teach
 from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView
@@ -33,6 +44,45 @@ logger = logging.getLogger(__name__)
 
 ASKED = 24
 """Views that say how many metres a map unit has."""
+
+
+def distil(
+    student: DepthModule,
+    metadata: Metadata,
+    teacher: DepthNetwork,
+    runs: Iterable[PosedSequence],
+    config: TrainConfig,
+    out: OutFolder,
+    validation: Sequence[DepthFolder] = (),
+    reading: Mapping[str, object] = MappingProxyType({}),
+    hooks: Sequence[Hooks] = (),
+    cache: TeacherCache | None = None,
+    say: Callable[[str], None] = logger.info,
+) -> TrainingResult:
+    """Train ``student`` on the teacher's depth of ``runs``; resumes a training in ``out`` with the same inputs.
+
+    Metres are the teacher's, or the run's where it has none. The other arguments are those of `finetune`; ``say`` is
+    told what there is to learn from, in the first process.
+
+    Raises:
+        ConfigError: If neither the teacher nor a run gives metres; and as `finetune`.
+        SourceError: As `label` and `finetune`.
+    """
+    sha256 = file_hash(teacher.weights)
+    data, lines = Data(validation=list(validation)), []
+    for number, run in enumerate(runs):
+        if not (teacher.is_metric or run.metric):
+            raise ConfigError(f"{run.name}: neither the teacher nor the run gives metres; add telemetry to it")
+        scale = None if teacher.is_metric else 0.0
+        folder = subfolder(out.path, "labels") / f"{number}-{run.name}-{sha256[:12]}"
+        if cache is not None:
+            folder = cache.entry(run.name, str(posed_set(run).sha256), sha256, repr(scale))
+        labels = label(teacher, run, scale, folder)
+        data.labelled.append(labels.folder)
+        lines.append(labels.describe())
+    for line in (*lines, *data.describe()) if rank() == 0 else ():
+        say(line)
+    return finetune(student, metadata, data, config, out, reading=reading, hooks=hooks, calibrate=True)
 
 
 def new_student(variant: Variant) -> tuple[FastDepth, Metadata]:
