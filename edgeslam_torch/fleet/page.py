@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
+from edgeslam_torch.eval.experiment.figures import Figure
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.fleet.folder import PAGE, RECORD, TABLE
-from edgeslam_torch.fleet.table import COLUMNS, DONE, FAILED, WAITING, Column, Row, counts, medians
+from edgeslam_torch.fleet.table import COLUMNS, DONE, FAILED, WAITING, Row, cell, counts, medians
 
 _TEMPLATE = Path(__file__).parent / "template"
 
@@ -23,7 +24,7 @@ def write_page(folder: Path, rows: Sequence[Row]) -> None:
 
 def render(rows: Sequence[Row]) -> str:
     """The page as text."""
-    shown = [column for column in COLUMNS if any(column.cell(row.figures.get(column.name)) for row in rows)]
+    shown = [column for column in COLUMNS if any(cell(column, row.figures.get(column.name)) for row in rows)]
     parts = {
         "style": _part("style.css"),
         "script": _part("sort.js"),
@@ -49,15 +50,15 @@ def _summary(rows: Sequence[Row]) -> str:
     middle = medians(rows)
     named = [(c, middle[c.name]) for c in COLUMNS if c.name in ("tracked", "ate_m", "cpu_ms") and c.name in middle]
     if named:
-        words.append("medians: " + ", ".join(f"{column.title} = {column.cell(value)}" for column, value in named))
+        words.append("medians: " + ", ".join(f"{column.title} = {cell(column, value)}" for column, value in named))
     return "; ".join(words) + "."
 
 
-def _titles(shown: Sequence[Column], rows: Sequence[Row]) -> list[tuple[str, bool]]:
+def _titles(shown: Sequence[Figure], rows: Sequence[Row]) -> list[tuple[str, bool]]:
     return [("flight", False), ("state", False), *((c.title, _is_numeric(c, rows)) for c in shown), ("remarks", False)]
 
 
-def _is_numeric(column: Column, rows: Sequence[Row]) -> bool:
+def _is_numeric(column: Figure, rows: Sequence[Row]) -> bool:
     return not any(isinstance(row.figures.get(column.name), str) for row in rows)
 
 
@@ -66,7 +67,7 @@ def _head(title: str, numeric: bool) -> str:
     return f'<th{kind} scope="col"><button type="button">{html.escape(title)}</button></th>'
 
 
-def _row(row: Row, shown: Sequence[Column]) -> str:
+def _row(row: Row, shown: Sequence[Figure]) -> str:
     name = html.escape(row.name)
     target = f"{row.folder}/report.html" if row.folder else row.log
     link = f'<a href="{_link(target)}">{name}</a>' if target else name
@@ -76,7 +77,7 @@ def _row(row: Row, shown: Sequence[Column]) -> str:
     cells = [f'<td data-key="{name}">{link}{image}</td>', state]
     for column in shown:
         value = row.figures.get(column.name)
-        text = html.escape(column.cell(value))
+        text = html.escape(cell(column, value))
         key = f' data-key="{float(value)!r}"' if isinstance(value, int | float) and text else ""
         cells.append(f'<td class="number"{key}>{text}</td>' if not isinstance(value, str) else f"<td>{text}</td>")
     again = [f"attempt {row.attempts}"] if row.attempts > 1 else []

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch import __version__
+from edgeslam_torch.eval.experiment.figures import Figure
+from edgeslam_torch.eval.metrics.run_score import finite
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.fleet.folder import RECORD, TABLE
 
@@ -21,40 +23,29 @@ FORMAT = 1
 """Of the record."""
 
 
-@dataclass(frozen=True, slots=True)
-class Column:
-    """One figure of the table."""
-
-    name: str
-    title: str
-    text: str = "{:.0f}"
-    factor: float = 1.0
-
-    def cell(self, value: Any) -> str:
-        """The figure in words; empty when there is none."""
-        if value is None or (isinstance(value, float) and not math.isfinite(value)):
-            return ""
-        return str(value) if isinstance(value, str) else self.text.format(self.factor * value)
-
-
 COLUMNS = (
-    Column("frames", "frames"),
-    Column("tracked", "tracked %", "{:.1f}", 100.0),
-    Column("lost", "lost"),
-    Column("pieces", "pieces"),
-    Column("ate_m", "ATE, Sim(3) [cm]", "{:.2f}", 100.0),
-    Column("ate_metric_m", "ATE, SE(3) [cm]", "{:.2f}", 100.0),
-    Column("online_m", "live ATE [cm]", "{:.2f}", 100.0),
-    Column("scale_error", "scale - 1 [%]", "{:+.1f}", 100.0),
-    Column("scale_sigma", "its sigma [%]", "{:.1f}", 100.0),
-    Column("scale_source", "scale from"),
-    Column("map_median_m", "map error [cm]", "{:.1f}", 100.0),
-    Column("edge_points", "edge points"),
-    Column("fps", "frames/s", "{:.1f}"),
-    Column("cpu_ms", "CPU ms", "{:.0f}"),
-    Column("memory_mb", "MB"),
+    Figure("frames", "frames", "{:.0f}"),
+    Figure("tracked", "tracked %", "{:.1f}", 100.0),
+    Figure("lost", "lost", "{:.0f}"),
+    Figure("pieces", "pieces", "{:.0f}"),
+    Figure("ate_m", "ATE, Sim(3) [cm]", "{:.2f}", 100.0),
+    Figure("ate_metric_m", "ATE, SE(3) [cm]", "{:.2f}", 100.0),
+    Figure("online_m", "live ATE [cm]", "{:.2f}", 100.0),
+    Figure("scale_error", "scale - 1 [%]", "{:+.1f}", 100.0),
+    Figure("scale_sigma", "its sigma [%]", "{:.1f}", 100.0),
+    Figure("scale_source", "scale from", "{:.0f}"),
+    Figure("map_median_m", "map error [cm]", "{:.1f}", 100.0),
+    Figure("edge_points", "edge points", "{:.0f}"),
+    Figure("fps", "frames/s", "{:.1f}"),
+    Figure("cpu_ms", "CPU ms", "{:.0f}"),
+    Figure("memory_mb", "MB", "{:.0f}"),
 )
 """Figures of `run_flight.figures` that the page shows, in its order."""
+
+
+def cell(figure: Figure, value: Any) -> str:
+    """A figure in words; empty when there is none."""
+    return value if isinstance(value, str) else figure.cell([value], none="")
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +90,7 @@ def write_tables(folder: Path, rows: Sequence[Row]) -> None:
         "medians": medians(rows),
         "flights": [asdict(row) for row in rows],
     }
-    write_text(folder / RECORD, json.dumps(_finite(record), indent=1) + "\n")
+    write_text(folder / RECORD, json.dumps(finite(record), indent=1) + "\n")
     write_text(folder / TABLE, _csv(rows))
 
 
@@ -142,12 +133,3 @@ def _no_formula(cell: Any) -> Any:
     Spreadsheets skip blanks before a formula, and take the signs of full width for the plain ones.
     """
     return f"'{cell}" if isinstance(cell, str) and cell.lstrip()[:1] in tuple("=+-@\uff1d\uff0b\uff0d\uff20") else cell
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no NaN."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,67 +1,52 @@
 """Scores as tables, aligned text for a terminal or Markdown: every run on its own line."""
 
 import textwrap
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from edgeslam_torch.eval.experiment.figures import Figure
 from edgeslam_torch.eval.metrics.common_frames import CommonScore
 from edgeslam_torch.eval.metrics.depth_error import DepthReport
 from edgeslam_torch.eval.metrics.edge_map_score import THRESHOLDS_M
 from edgeslam_torch.eval.metrics.run_score import RunScore
 
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    """One column of a table."""
-
-    title: str
-    value: Callable[[RunScore], float]
-    text: str = "{:.4f}"
-
-    def cell(self, value: float) -> str:
-        """The value as text, a dash when there is none."""
-        return self.text.format(value) if np.isfinite(value) else "-"
-
-
-def _map(name: str, threshold: float | None = None) -> Callable[[RunScore], float]:
-    def value(score: RunScore) -> float:
-        if score.map is None:
-            return float("nan")
-        found = getattr(score.map, name)
-        return float(found if threshold is None else found.get(threshold, float("nan")))
-
-    return value
-
-
 TRAJECTORY_COLUMNS = (
-    Column("ATE Sim(3) [m]", lambda s: s.ate_sim3_m),
-    Column("ATE SE(3) [m]", lambda s: s.ate_se3_m),
-    Column("online Sim(3) [m]", lambda s: s.ate_online_sim3_m),
-    Column("scale - 1", lambda s: s.scale_error, "{:+.1%}"),
-    Column("coverage", lambda s: s.coverage, "{:.1%}"),
-    Column("first pose [s]", lambda s: s.first_pose_s, "{:.2f}"),
-    Column("rotation [deg]", lambda s: s.rotation_deg, "{:.2f}"),
-    Column("RPE 1 s [m]", lambda s: s.rpe_1s_m),
-    Column("RPE 1 s [deg]", lambda s: s.rpe_1s_deg, "{:.2f}"),
-    Column("full transform (unitless)", lambda s: s.full_transform),
-    Column("poses", lambda s: s.matched, "{:.0f}"),
+    Figure("ate_sim3_m", "ATE Sim(3) [m]"),
+    Figure("ate_se3_m", "ATE SE(3) [m]"),
+    Figure("ate_online_sim3_m", "online Sim(3) [m]"),
+    Figure("scale_error", "scale - 1", "{:+.1%}"),
+    Figure("coverage", "coverage", "{:.1%}"),
+    Figure("first_pose_s", "first pose [s]", "{:.2f}"),
+    Figure("rotation_deg", "rotation [deg]", "{:.2f}"),
+    Figure("rpe_1s_m", "RPE 1 s [m]"),
+    Figure("rpe_1s_deg", "RPE 1 s [deg]", "{:.2f}"),
+    Figure("full_transform", "full transform (unitless)"),
+    Figure("matched", "poses", "{:.0f}"),
 )
-
+"""By the name in a `RunScore`."""
 TERMINAL_COLUMNS = tuple(c for c in TRAJECTORY_COLUMNS if "unitless" not in c.title)
 """What fits beside one another; the paper's unitless figure is in the details."""
-
 MAP_COLUMNS = (
-    Column("points", _map("points"), "{:.0f}"),
-    Column("judged", _map("judged_share"), "{:.0%}"),
-    Column("median [m]", _map("median_m")),
-    Column("one-map median [m]", _map("single_map_median_m")),
-    Column("own alignment [m]", _map("own_alignment_median_m")),
-    *(Column(f"accuracy {100 * t:.0f} cm", _map("accuracy", t), "{:.0%}") for t in THRESHOLDS_M),
-    *(Column(f"edges {100 * t:.0f} cm", _map("completeness", t), "{:.0%}") for t in THRESHOLDS_M),
-    *(Column(f"F {100 * t:.0f} cm", _map("f_score", t), "{:.2f}") for t in THRESHOLDS_M),
+    Figure("points", "points", "{:.0f}"),
+    Figure("judged_share", "judged", "{:.0%}"),
+    Figure("median_m", "median [m]"),
+    Figure("single_map_median_m", "one-map median [m]"),
+    Figure("own_alignment_median_m", "own alignment [m]"),
+    *(Figure(f"accuracy {t}", f"accuracy {100 * t:.0f} cm", "{:.0%}") for t in THRESHOLDS_M),
+    *(Figure(f"completeness {t}", f"edges {100 * t:.0f} cm", "{:.0%}") for t in THRESHOLDS_M),
+    *(Figure(f"f_score {t}", f"F {100 * t:.0f} cm", "{:.2f}") for t in THRESHOLDS_M),
 )
+"""By the name in a `MapScore`, with the threshold."""
+
+
+def _value(score: RunScore, column: Figure) -> float:
+    """NaN where there is none."""
+    name, _, threshold = column.name.partition(" ")
+    found = getattr(score, name, None) if column in TRAJECTORY_COLUMNS else getattr(score.map, name, None)
+    found = found.get(float(threshold)) if threshold and found is not None else found
+    return float("nan") if found is None else float(found)
 
 
 def text_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -126,12 +111,10 @@ def report_of_two(first: RunScore, second: RunScore) -> str:
     """Every figure of two runs, and the second's minus the first's."""
     rows = []
     for column in (*TRAJECTORY_COLUMNS, *MAP_COLUMNS):
-        a, b = column.value(first), column.value(second)
+        a, b = (_value(score, column) for score in (first, second))
+        signed = replace(column, text=column.text.replace("{:+", "{:").replace("{:", "{:+"))
         if np.isfinite(a) or np.isfinite(b):
-            difference = (
-                column.text.replace("{:", "{:+").replace("++", "+").format(b - a) if np.isfinite(b - a) else "-"
-            )
-            rows.append([column.title, column.cell(a), column.cell(b), difference])
+            rows.append([column.title, column.cell([a]), column.cell([b]), signed.cell([b - a])])
     lines = [f"A: {first.name}", f"B: {second.name}", f"Ground truth: {first.dataset}", ""]
     lines += [text_table(["", "A", "B", "B - A"], rows), ""]
     lines += [f"- {letter}: {note}" for letter, s in zip("AB", (first, second), strict=True) for note in _notes(s)]
@@ -166,10 +149,10 @@ def common_report(scores: Sequence[CommonScore], markdown: bool = False) -> str:
     return f"{head}\n\n" + (markdown_table if markdown else text_table)(titles, rows)
 
 
-def _cells(scores: Sequence[RunScore], columns: Sequence[Column]) -> tuple[list[str], list[list[str]]]:
+def _cells(scores: Sequence[RunScore], columns: Sequence[Figure]) -> tuple[list[str], list[list[str]]]:
     """Titles and rows, without the columns that no run has."""
-    used = [c for c in columns if any(np.isfinite(c.value(s)) for s in scores)]
-    return ["run", *(c.title for c in used)], [[s.name, *(c.cell(c.value(s)) for c in used)] for s in scores]
+    used = [c for c in columns if any(np.isfinite(_value(s, c)) for s in scores)]
+    return ["run", *(c.title for c in used)], [[s.name, *(c.cell([_value(s, c)]) for c in used)] for s in scores]
 
 
 def _notes(score: RunScore) -> list[str]:
