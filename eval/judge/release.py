@@ -86,14 +86,15 @@ def release_record(rows: Sequence[Row], commit: str, outputs: dict[str, list[str
     failed = [f"{row['cell']} seed {row['seed']}: {row['error']}" for row in rows if row["error"]]
     if failed:
         raise EvaluationError(f"no release: {len(failed)} runs failed, such as {failed[0]}")
-    cells = {}
+    cells: dict[str, dict[str, Any]] = {}
     for name, seeds in RUNS.items():
         own = [row["figures"] for row in rows if row["cell"] == name and row["seed"] < seeds]
         if len(own) < seeds:
             raise EvaluationError(f"no release: {name} has {len(own)} of {seeds} runs")
-        known = {key: [f[key] for f in own if f.get(key) is not None] for key in FIGURES}
-        spread = {k: [_rounded(g(v), k) for g in (np.median, np.min, np.max)] for k, v in known.items() if v}
-        cells[name] = {"seeds": seeds, **spread}
+        cells[name] = {"seeds": seeds}
+        for key in FIGURES:
+            if known := [f[key] for f in own if f.get(key) is not None]:
+                cells[name][key] = [_rounded(middle(known), key) for middle in (np.median, np.min, np.max)]
     everything = [row["figures"] for row in rows]
     return {
         "version": __version__,

@@ -8,7 +8,6 @@ import base64
 import html
 import json
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,19 +41,6 @@ _KEYFRAME_WIDTH_PX = 480
 _MAX_FRUSTA = 60
 TEMPLATE = Path(__file__).parent / "template"
 _SCRIPTS = ("data.js", "viewer.js", "charts.js", "page.js")
-
-
-@dataclass(frozen=True, slots=True)
-class _View:
-    """Where the page's camera starts and how far the scene reaches, robust against stray points."""
-
-    lo: FloatArray
-    hi: FloatArray
-    target: FloatArray
-    radius: float
-    floor: float
-    height: tuple[float, float]
-    """Heights of the points at the ends of the colour ramp."""
 
 
 def write_report(
@@ -132,23 +118,22 @@ def _payload(
     truth: Trajectory | None,
     turn: FloatArray,
 ) -> tuple[dict[str, Any], str, str]:
-    step = max(1, -(-len(run.trajectory) // _MAX_POSES))
-    trajectory = run.trajectory.take(slice(None, None, step))
+    trajectory = run.trajectory.take(slice(None, None, max(1, -(-len(run.trajectory) // _MAX_POSES))))
     begin = float(run.trajectory.stamps_s[0])
     positions = trajectory.positions @ turn.T
     table = _StatusTable(run, trajectory)
-    view = _view(edges.p_w @ turn.T, positions)
-    units = words.unit(run)
     edge_meta, edge_bytes = _packed(edges, turn)
     anchor_meta, anchor_bytes = _packed(anchors, turn)
     rotations = np.swapaxes(turn @ trajectory.T_w_c[:, :3, :3], 1, 2)  # rows are the camera's axes in the world
+    config = run.path / "config.toml"
+    settings = config.read_text(encoding="utf-8", errors="replace") if config.is_file() else None
     data: dict[str, Any] = {
         "title": words.title(run),
         "story": words.story(run, score),
         "warnings": words.warnings(run.summary),
         "tiles": words.tiles(run, score, len(edges.p_w)),
         "foot": words.foot(run),
-        "unit": units,
+        "unit": words.unit(run),
         "edges": edge_meta,
         "anchors": anchor_meta,
         "positions": _rounded(positions, 4),
@@ -167,19 +152,11 @@ def _payload(
         "stages": table.stages(),
         "truth": _truth_in_run(truth, score, turn),
         "error": _error(score, begin),
-        "home": {
-            "target": _rounded(view.target, 4),
-            "radius": round(view.radius, 4),
-            "yaw": _yaw(rotations, positions, view),
-        },
-        "box": {"lo": _rounded(view.lo, 4), "hi": _rounded(view.hi, 4)},
-        "floor": round(view.floor, 4),
-        "gridStep": _grid_step(view.radius),
-        "height": [round(h, 3) for h in view.height],
+        **_view(edges.p_w @ turn.T, positions, rotations),
         "keyframes": _keyframes(run, edges, trajectory.stamps_s[table.keyframes()], begin),
         "mapScore": words.map_rows(score),
         "summary": words.flat_rows(run.summary),
-        "config": _config(run),
+        "config": None if settings is None else words.without_folders(settings),
     }
     return data, edge_bytes, anchor_bytes
 
@@ -225,10 +202,11 @@ class _StatusTable:
         if value is None or sigma is None:
             return None
         both = list(zip(value, sigma, strict=True))
-        known = [v if v is not None and s is not None else None for v, s in both]
-        low = [round(v - 1.96 * s, 5) if v is not None and s is not None else None for v, s in both]
-        high = [round(v + 1.96 * s, 5) if v is not None and s is not None else None for v, s in both]
-        return {"value": known, "low": low, "high": high, "note": note}
+        ends = {"value": 0.0, "low": -1.96, "high": 1.96}
+        return {
+            name: [round(v + k * s, 5) if v is not None and s is not None else None for v, s in both]
+            for name, k in ends.items()
+        } | {"note": note}
 
     def stages(self) -> list[dict[str, Any]]:
         """Median and 95th percentile of every ``*_ms`` column over the frames in which the stage ran."""
@@ -352,32 +330,36 @@ def _log_codes(sigma: FloatArray) -> tuple[np.ndarray, list[float]]:
     return codes.astype(np.uint8), [float(f"{lo:.4g}"), float(f"{hi:.4g}")]
 
 
-def _view(points: FloatArray, positions: FloatArray) -> _View:
+def _view(points: FloatArray, positions: FloatArray, rotations: FloatArray) -> dict[str, Any]:
+    """Where the page's camera starts, how far the scene reaches, its floor and the heights at the ends of the colour
+    ramp; robust against stray points."""
     lo, hi = positions.min(axis=0), positions.max(axis=0)
+    low, high, floor = lo[2], hi[2], float("-inf")
+    core = positions
     if len(points):
         a, b = np.quantile(points, [0.02, 0.98], axis=0)
         lo, hi = np.minimum(lo, a), np.maximum(hi, b)
+        low, high, floor = a[2], b[2], float(np.quantile(points[:, 2], 0.005))
+        # The far background is in the box of the flat views; the 3-D view starts on what most points are.
+        core = np.concatenate([np.quantile(points, [0.05, 0.95], axis=0), positions])
     extent = np.maximum(hi - lo, 1e-3)
     lo, hi = lo - 0.03 * extent, hi + 0.03 * extent
-    floor = float(np.quantile(points[:, 2], 0.005)) if len(points) else float(lo[2])
-    low, high = (float(h) for h in np.quantile(points[:, 2], [0.02, 0.98])) if len(points) else (lo[2], hi[2])
-    # The far background is in the box of the flat views; the 3-D view starts on what most points are.
-    core = np.concatenate([np.quantile(points, [0.05, 0.95], axis=0), positions]) if len(points) else positions
+    low, high = (float(low), float(high)) if len(points) else (float(lo[2]), float(hi[2]))
+    floor = max(floor if len(points) else float(lo[2]), float(lo[2] - extent[2]))
     a, b = core.min(axis=0), core.max(axis=0)
-    radius = max(float(np.linalg.norm(b - a) / 2), 1e-3)
-    floor = max(floor, float(lo[2] - extent[2]))
-    return _View(lo, hi, (a + b) / 2, radius, floor, (low, max(high, low + 1e-3)))
-
-
-def _yaw(rotations: FloatArray, positions: FloatArray, view: _View) -> float:
-    """Start behind the cameras, a little to the side: the map is seen as they saw it."""
+    target, radius = (a + b) / 2, max(float(np.linalg.norm(b - a) / 2), 1e-3)
+    # Start behind the cameras, a little to the side: the map is seen as they saw it.
     forward = rotations[:, 2].mean(axis=0)
-    back = -forward if np.linalg.norm(forward[:2]) > 0.2 else positions.mean(axis=0) - view.target
-    return round(float(np.arctan2(back[1], back[0])) + 0.5, 4)
-
-
-def _grid_step(radius: float) -> float:
-    return float(next((s for s in (0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10, 25, 50) if s > radius / 6), 100))
+    back = -forward if np.linalg.norm(forward[:2]) > 0.2 else positions.mean(axis=0) - target
+    yaw = float(np.arctan2(back[1], back[0])) + 0.5
+    steps = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 25.0, 50.0)
+    return {
+        "home": {"target": _rounded(target, 4), "radius": round(radius, 4), "yaw": round(yaw, 4)},
+        "box": {"lo": _rounded(lo, 4), "hi": _rounded(hi, 4)},
+        "floor": round(floor, 4),
+        "gridStep": next((step for step in steps if step > radius / 6), 100.0),
+        "height": [round(h, 3) for h in (low, max(high, low + 1e-3))],
+    }
 
 
 def _truth_in_run(truth: Trajectory | None, score: RunScore | None, turn: FloatArray) -> list[list[float]] | None:
@@ -422,11 +404,6 @@ def _jpeg(image: np.ndarray) -> str:
         image = cv2.resize(image, (_KEYFRAME_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
     jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
     return "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode("ascii")
-
-
-def _config(run: RunFolder) -> str | None:
-    path = run.path / "config.toml"
-    return words.without_folders(path.read_text(encoding="utf-8", errors="replace")) if path.is_file() else None
 
 
 def _rounded(values: FloatArray, digits: int) -> list[Any]:
