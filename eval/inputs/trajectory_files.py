@@ -199,13 +199,10 @@ def _from_columns(table: Table, columns: Columns, path: Path) -> Trajectory:
     numbers = table.numbers([*columns.position, *rotation, *(index for index, _ in columns.time)])
     poses, time = np.split(numbers, [3 + len(rotation)], axis=1)
     stamps_s, notes = _seconds(time, [unit for _, unit in columns.time])
-    finite = np.isfinite(stamps_s) & np.isfinite(poses).all(axis=1)
-    if not finite.any():
-        raise EvaluationError(f"{path}: every pose holds a NaN or infinity")
-    if not finite.all():
-        notes.append(f"{np.count_nonzero(~finite)} of {len(poses)} poses are not finite and were left out")
-    stamps_s, poses = stamps_s[finite], poses[finite]
-    if columns.quaternion is not None:
+    stamps_s, poses = _finite(stamps_s, poses, str(path), notes)
+    T = np.tile(np.eye(4), (len(poses), 1, 1))
+    T[:, :3, 3] = columns.metres * poses[:, :3]
+    if rotation:
         norms = np.linalg.norm(poses[:, 3:], axis=1)
         odd = np.abs(norms - 1.0) > 0.05  # files with three decimals stay within 0.005
         if odd.mean() > 0.5:
@@ -215,13 +212,20 @@ def _from_columns(table: Table, columns: Columns, path: Path) -> Trajectory:
             )
         if odd.any():
             notes.append(f"{np.count_nonzero(odd)} poses without a unit quaternion were left out")
-            stamps_s, poses = stamps_s[~odd], poses[~odd]
-    T = np.tile(np.eye(4), (len(poses), 1, 1))
-    if columns.quaternion is not None:
-        T[:, :3, :3] = Rotation.from_quat(poses[:, 3:]).as_matrix()
-    T[:, :3, 3] = columns.metres * poses[:, :3]
-    stamps_s, T_w_c, more = _increasing(stamps_s, T, str(path))
-    return Trajectory(stamps_s, T_w_c, str(path), tuple(notes + more), oriented=columns.quaternion is not None)
+        stamps_s, T = stamps_s[~odd], T[~odd]
+        T[:, :3, :3] = Rotation.from_quat(poses[~odd, 3:]).as_matrix()
+    stamps_s, T = _increasing(stamps_s, T, str(path), notes)
+    return Trajectory(stamps_s, T, str(path), tuple(notes), oriented=columns.quaternion is not None)
+
+
+def _finite(stamps_s: FloatArray, values: FloatArray, source: str, notes: list[str]) -> tuple[FloatArray, FloatArray]:
+    """Poses, in any form ``(N, ...)``, without those that are not finite."""
+    finite = np.isfinite(values).reshape(len(values), -1).all(axis=1) & np.isfinite(stamps_s)
+    if not finite.any():
+        raise EvaluationError(f"{source}: every pose holds a NaN or infinity")
+    if not finite.all():
+        notes.append(f"{np.count_nonzero(~finite)} of {len(values)} poses are not finite and were left out")
+    return stamps_s[finite], values[finite]
 
 
 def _seconds(time: FloatArray, units: Sequence[float | None]) -> tuple[FloatArray, list[str]]:
@@ -265,9 +269,8 @@ def _mount(sensor: Path) -> FloatArray | None:
     return T_b_s
 
 
-def _increasing(stamps_s: FloatArray, T: FloatArray, source: str) -> tuple[FloatArray, FloatArray, list[str]]:
+def _increasing(stamps_s: FloatArray, T: FloatArray, source: str, notes: list[str]) -> tuple[FloatArray, FloatArray]:
     """Poses in order of time, one a stamp."""
-    notes: list[str] = []
     steps = np.diff(stamps_s)
     if len(steps) and np.all(steps < 0):
         notes.append("the rows run backwards in time: sorted")
@@ -284,21 +287,16 @@ def _increasing(stamps_s: FloatArray, T: FloatArray, source: str) -> tuple[Float
         )
     if again.any():
         notes.append(f"{np.count_nonzero(again)} row(s) repeat a stamp: the first of each was kept")
-    return stamps_s[~again], T[~again], notes
+    return stamps_s[~again], T[~again]
 
 
 def _from_matrices(stamps_s: FloatArray, T: FloatArray, source: str, notes: list[str]) -> Trajectory:
-    finite = np.isfinite(T).all(axis=(1, 2)) & np.isfinite(stamps_s)
-    if not finite.any():
-        raise EvaluationError(f"{source}: every pose holds a NaN or infinity")
-    if not finite.all():
-        notes.append(f"{np.count_nonzero(~finite)} of {len(T)} poses are not finite and were left out")
-    stamps_s, T = stamps_s[finite], T[finite].copy()
+    stamps_s, T = _finite(stamps_s, T, source, notes)
     if np.median(np.abs(np.linalg.det(T[:, :3, :3]) - 1.0)) > 0.05:
         raise EvaluationError(f"{source}: the 3x3 parts are no rotations (determinant not 1)")
     T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
-    stamps_s, T, more = _increasing(stamps_s, T, source)
-    return Trajectory(stamps_s, T, source, tuple(notes + more))
+    stamps_s, T = _increasing(stamps_s, T, source, notes)
+    return Trajectory(stamps_s, T, source, tuple(notes))
 
 
 def _from_kitti(table: FloatArray, path: Path, stamps_s: FloatArray | None) -> Trajectory:
