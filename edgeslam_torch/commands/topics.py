@@ -38,7 +38,8 @@ def main(args: argparse.Namespace) -> int:
             raise
         doubt = str(error)
     else:
-        used = {name: role for role, name in choice.telemetry.items()} | {choice.image: "image"}
+        used = dict.fromkeys(choice.imu, "imu") | {name: role for role, name in choice.telemetry.items()}
+        used |= {choice.image: "image"}
         used |= {} if choice.camera is None else {choice.camera: "camera"}
         remarks = choice.remarks
     rows = [("topic", "type", "messages", "Hz", "used as")]

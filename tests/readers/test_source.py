@@ -375,3 +375,19 @@ def test_a_picture_beside_the_folder_of_images_is_not_the_recording(tmp_path, wr
     write_images(tmp_path / "frames", [f"{i}.png" for i in range(5)])
     with pytest.raises(SourceError, match="5 in its folder frames"):
         open_source(tmp_path)
+
+
+def test_an_imu_beside_the_images_is_used_unless_the_user_says_otherwise(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "seq", 5)
+    rows = [f"{100 + 0.005 * i:.3f},0,0,0.1,0,0,9.81" for i in range(80)]
+    (folder / "imu.csv").write_text("\n".join(rows) + "\n")
+    (tmp_path / "other.csv").write_text("\n".join(rows[10:]) + "\n")
+    own, none, other = (open_source(folder, imu=imu) for imu in (None, "none", tmp_path / "other.csv"))
+    assert len(own.imu_readings) == 80 and own.imu.rate_hz == pytest.approx(200)
+    assert none.imu is None and none.imu_readings is None and not none.warnings[1:]
+    assert len(other.imu_readings) == 70
+    given = [reading for _, readings in own.steps() for reading in readings]
+    assert sum(map(len, given)) == 80
+    assert own.part(3, 1).imu_readings.stamps_s[0] >= 99.3
+    with pytest.raises(SourceError, match="gone"):
+        open_source(folder, imu=tmp_path / "gone.csv")

@@ -121,7 +121,7 @@ def _merged(
 ) -> tuple[list[TelemetrySample], list[str]]:
     said: list[str] = []
     if "imu" in tables and _never_turns(tables["imu"][:, 1:5]):
-        said.append(f"{topics['imu']}: holds no attitude, so it is not used")
+        said.append(f"{topics['imu']}: holds no attitude")
         del tables["imu"]
     order = [role for role in ("tello", "odom", "velocity") if role in tables]
     order.sort(key=lambda role: role not in asked)

@@ -75,17 +75,17 @@ def choose(bag: Bag, wanted: Sequence[str] = ()) -> Choice:
     """
     requests = _requests(bag, wanted)
     image = _image(bag, requests.get(IMAGE))
-    telemetry, remarks = _telemetry(bag, requests)
+    imus = [topic for topic in bag.topics if role_of(topic) == "imu" and topic.count]
+    if (named := requests.get("imu")) is not None:
+        imus = [topic for topic in imus if topic.name == named]
+    imu, said = choose_imu(imus, image)
+    telemetry, remarks = _telemetry(bag, requests | ({"imu": imu[0]} if imu else {}))
+    remarks += [] if said is None else [said]
     asked = frozenset(role for role, name in requests.items() if name != _NOTHING)
     if depth_of(bag, next(topic for topic in bag.topics if topic.name == image)) == THERMAL:
         remarks.append(
             f"{image}: {THERMAL} is read as 16-bit pictures, since the topic was named; depth maps have the same format"
         )
-    imus = [topic for topic in bag.topics if role_of(topic) == "imu" and topic.count]
-    if (named := requests.get("imu")) is not None:
-        imus = [topic for topic in imus if topic.name == named]
-    imu, said = choose_imu(imus, image)
-    remarks += [] if said is None else [said]
     return Choice(image, _camera(bag, image, requests.get(CAMERA)), telemetry, asked, tuple(remarks), imu)
 
 

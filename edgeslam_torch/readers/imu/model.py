@@ -138,5 +138,5 @@ def _assumed(found: dict[str, Any], stated_hz: float, rate_hz: float) -> list[st
 def _named(path: Path) -> Iterator[None]:
     try:
         yield
-    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
         raise CalibrationError(f"{path}: no IMU's numbers ({error})") from error

@@ -48,7 +48,10 @@ def read_readings(path: Path) -> tuple[ImuReadings, list[str]]:
     stamps_s, unit = seconds_of(values[:, 0], _GAPS_S)
     if unit == UNKNOWN:
         raise SourceError(f"{path}: its stamps are in no unit in which readings come 1 to 10000 times a second")
-    readings, remarks = tidied(stamps_s, rate, values[:, 1 + n :], bool(n))
+    try:
+        readings, remarks = tidied(stamps_s, rate, values[:, 1 + n :], bool(n))
+    except SourceError as error:
+        raise SourceError(f"{path}: {error}") from error
     return readings, [f"{path}: {remark}" for remark in remarks]
 
 
@@ -60,7 +63,7 @@ def _columns(table: Table) -> tuple[int, Sequence[int], Sequence[int], Sequence[
     axes = sorted(range(len(plain)), key=lambda i: plain[i][-1:])
     gyroscope = [i for i in axes if _GYROSCOPE.fullmatch(plain[i])]
     accelerometer = [i for i in axes if i not in gyroscope and _ACCELEROMETER.fullmatch(plain[i])]
-    if len(accelerometer) == 3 and len(gyroscope) in (0, 3):
+    if [plain[i][-1] for i in accelerometer] == ["x", "y", "z"] and len({plain[i][-1] for i in gyroscope}) in (0, 3):
         stamp = next((i for i, name in enumerate(plain) if _STAMP.fullmatch(name)), 0)
         return stamp, gyroscope, accelerometer, [names[i] for i in (*gyroscope, *accelerometer)]
     if width == 7:
@@ -107,7 +110,8 @@ def tidied(
 
 
 def _in_m_s2(force: FloatArray) -> tuple[FloatArray, list[str]]:
-    size = float(np.median(np.linalg.norm(force, axis=1)))
+    with np.errstate(over="ignore"):
+        size = float(np.median(np.linalg.norm(force, axis=1)))
     for unit, factor in _UNITS_M_S2.items():
         if _NEAR_G[0] < size * factor / _G_M_S2 < _NEAR_G[1]:
             said = [] if factor == 1.0 else [f"accelerations of about {size:.3g} are taken as {unit}"]

@@ -88,5 +88,5 @@ def test_what_is_no_imu_is_refused(tmp_path, columns, words):
 @pytest.mark.parametrize("text", ["", "1 2\n", "1 a b c d e f\n", "nan nan nan nan\n"])
 def test_text_that_is_no_table_of_readings_is_refused(tmp_path, text):
     (tmp_path / "imu.csv").write_text(text)
-    with pytest.raises(SourceError, match=r"imu\.csv|IMU"):
+    with pytest.raises(SourceError, match=r"imu\.csv"):
         read_readings(tmp_path / "imu.csv")
