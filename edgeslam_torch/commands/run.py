@@ -153,9 +153,10 @@ def main(args: argparse.Namespace) -> int:
 
             listeners.append(KeyframeImages(out))
         if args.save_mcap is not None:
+            from edgeslam_torch.readers.pace import ReadingsCursor
             from edgeslam_torch.viewer.mcap_view import McapView
 
-            saved = McapView(source.camera, args.save_mcap)
+            saved = McapView(source.camera, args.save_mcap, ReadingsCursor(source))
             listeners.append(saved)
             files.callback(saved.close)
         result = run(source, out, config, mode, listeners, atlas=AtlasFiles(earlier, args.save_atlas))

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,8 @@ import numpy as np
 from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.frontend.edges import extract_edges
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.imu import ImuReadings, separated
+from edgeslam_torch.readers.pace import ReadingsCursor
 from edgeslam_torch.types import DISAGREEMENT, FloatArray, Frame, FrameStatus, Health, PoseNow, SlamOutput
 from edgeslam_torch.writers.mcap import messages
 from edgeslam_torch.writers.mcap.ros_file import RosFile
@@ -33,15 +35,20 @@ _OK, _WARNING, _ERROR = 0, 1, 2
 class McapView:
     """A listener of `edgeslam_torch.run.run`; a disk that fills up ends the file, not the run."""
 
-    def __init__(self, camera: Camera, path: Path) -> None:
+    def __init__(self, camera: Camera, path: Path, readings: ReadingsCursor | None = None) -> None:
         """Open the file.
+
+        Args:
+            camera: Of the pictures.
+            path: The file.
+            readings: Of the source's sensors, of which those of an IMU are written.
 
         Raises:
             OutputError: If it cannot be written.
             MissingPackageError: If rosbags or mcap is not installed.
         """
         self._file = RosFile(path)
-        self._camera = camera
+        self._camera, self._readings = camera, readings
         self._edges = EdgeConfig()
         self._keyframes = 0
         self._due = 1.0
@@ -53,6 +60,8 @@ class McapView:
         """Write pose, picture and state; for keyframes also features, and now and then path and map."""
         self._last_s = output.stamp_s
         self._keyframes += output.keyframe
+        felt = [] if self._readings is None else separated(self._readings.until(output.stamp_s))[1]
+        self._guarded(lambda: self._write_imu(felt))
         self._guarded(lambda: self._write_frame(frame, output, slam))
 
     def on_finish(self, slam: "Slam") -> None:
@@ -77,6 +86,11 @@ class McapView:
             self.failure = f"{self._file.path}: cannot be written ({error.strerror or error})"
             self._file.abandon()
             logger.warning("%s; the run goes on", self.failure)
+
+    def _write_imu(self, parts: Sequence[ImuReadings]) -> None:
+        for felt in parts:
+            for row in zip(felt.stamps_s.tolist(), felt.angular_rate_rad_s, felt.acceleration_m_s2, strict=True):
+                self._file.write("/imu", row[0], messages.imu(self._file, *row))
 
     def _write_frame(self, frame: Frame, output: SlamOutput, slam: "Slam") -> None:
         ros, t = self._file, output.stamp_s

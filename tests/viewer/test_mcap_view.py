@@ -10,6 +10,9 @@ import pytest
 from edgeslam_torch import cli
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.imu import ImuModel, ImuReadings
+from edgeslam_torch.readers.pace import ReadingsCursor
+from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.types import Frame, FrameStatus, Health, PointCloud, PoseNow, ScaleEstimate, SlamOutput
 
 pytest.importorskip("rosbags")
@@ -68,8 +71,8 @@ def _picture(index):
     return Frame(index, BEGIN_S + 0.1 * index, image)
 
 
-def _fly(path, count=6):
-    view, slam = McapView(CAMERA, path), _Slam()
+def _fly(path, count=6, readings=None):
+    view, slam = McapView(CAMERA, path, readings), _Slam()
     for i in range(count):
         slam.outputs.append(_output(i, keyframe=i % 5 == 0))
         view.on_frame(_picture(i), slam.outputs[-1], slam)
@@ -215,3 +218,13 @@ def test_what_a_run_found_is_not_offered_to_the_next(tmp_path, capsys):
     out = capsys.readouterr().out
     used = [line for line in out.splitlines() if line.endswith((" image", " camera", " odom"))]
     assert [line.split()[0] for line in used] == ["/camera/camera_info", "/camera/image/compressed"]
+
+
+def test_readings_of_an_imu_are_saved_and_read_again(tmp_path, rng):
+    stamps_s = BEGIN_S + 0.005 * np.arange(90)
+    felt = ImuReadings(stamps_s, rng.standard_normal((90, 3)), rng.standard_normal((90, 3)) + [0, 0, 9.81])
+    _fly(tmp_path / "a.mcap", readings=ReadingsCursor(SimpleNamespace(telemetry=[], imu=ImuModel(), imu_readings=felt)))
+    read = open_source(tmp_path / "a.mcap").imu_readings
+    assert read.stamps_s == pytest.approx(stamps_s, abs=1e-6)
+    assert (read.angular_rate_rad_s == felt.angular_rate_rad_s).all()
+    assert (read.acceleration_m_s2 == felt.acceleration_m_s2).all()

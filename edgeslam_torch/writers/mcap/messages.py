@@ -1,6 +1,7 @@
 """ROS 2 messages of poses, maps and pictures.
 
-Frames: ``map`` is the trajectory's world (z up), ``camera`` the camera's optical frame (x right, y down, z forward).
+Frames: ``map`` is the trajectory's world (z up), ``camera`` the camera's optical frame (x right, y down, z forward),
+``imu`` the IMU's own.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,7 +14,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, PointCloud
 
-MAP, CAMERA = "map", "camera"
+MAP, CAMERA, IMU = "map", "camera", "imu"
 UNKNOWN = 1e9
 """Variance of what is not known; ROS has no word for it in Odometry."""
 _JPEG_QUALITY = 80
@@ -136,6 +137,21 @@ def cloud(ros: Maker, stamp_s: float, points: PointCloud) -> Any:
         row_step=rows.nbytes,
         data=rows.view(np.uint8).ravel(),
         is_dense=True,
+    )
+
+
+def imu(ros: Maker, stamp_s: float, rate: FloatArray, force: FloatArray) -> Any:
+    """``sensor_msgs/Imu`` of one reading, ``(3,)`` [rad/s] and ``(3,)`` [m/s^2]; NaN where not measured."""
+    unknown, known = np.array([-1.0, *[0.0] * 8]), np.zeros(9)
+    return ros.make(
+        "sensor_msgs/msg/Imu",
+        header=header(ros, stamp_s, IMU),
+        orientation=_turn(ros, np.eye(4)),
+        orientation_covariance=unknown,
+        angular_velocity=_xyz(ros, "Vector3", np.nan_to_num(rate)),
+        angular_velocity_covariance=known if np.isfinite(rate).all() else unknown,
+        linear_acceleration=_xyz(ros, "Vector3", force),
+        linear_acceleration_covariance=known,
     )
 
 
