@@ -204,11 +204,10 @@ def focal_from_map(camera: Camera, keyframes: Sequence[Keyframe], p_w: FloatArra
     for _ in range(_NEWTON_STEPS):
         here = _refined_with(problem, camera, log_scale)
         problem = replace(problem, T_c_w=here.T_c_w, p_w=here.p_w)
-        less, more = (
-            _refined_with(problem, camera, log_scale + step).cost_after for step in (-_FOCAL_STEP, _FOCAL_STEP)
-        )
-        curvature = (less - 2.0 * here.cost_after + more) / _FOCAL_STEP**2
-        slope = (more - less) / (2.0 * _FOCAL_STEP)
+        slope = _slope(problem, camera, log_scale)
+        there = _refined_with(problem, camera, log_scale + _FOCAL_STEP)
+        beyond = _slope(replace(problem, T_c_w=there.T_c_w, p_w=there.p_w), camera, log_scale + _FOCAL_STEP)
+        curvature = (beyond - slope) / _FOCAL_STEP
         move = -slope / curvature if curvature > 0 else -math.copysign(limit, slope)
         limit = limit / 3.0 if move * last < 0 else limit  # Huber's cost is not quadratic: steps overshoot
         last = move
@@ -219,6 +218,18 @@ def focal_from_map(camera: Camera, keyframes: Sequence[Keyframe], p_w: FloatArra
             relative = math.hypot(_OPTIMISM * noise / math.sqrt(max(curvature, 1e-12)), 0.02)
             return FocalEstimate(focal, relative * focal, len(problem.T_c_w), "")
     return FocalEstimate(None, np.inf, len(problem.T_c_w), "the map fits no focal length")
+
+
+def _slope(problem: WindowProblem, camera: Camera, log_scale: float) -> float:
+    """Derivative of a refined map's cost by the log focal length; poses and anchors are at their minimum."""
+    scale, T = math.exp(log_scale), problem.T_c_w[problem.obs_pose]
+    p_c = (T[:, :3, :3] @ problem.p_w[problem.obs_anchor][:, :, None])[:, :, 0] + T[:, :3, 3]
+    front = p_c[:, 2] > 0
+    p_c, uv, inv_sigma = p_c[front], problem.uv[front], problem.inv_sigma[front, None]
+    from_centre = scale * np.array([camera.fx, camera.fy]) * p_c[:, :2] / p_c[:, 2:]
+    r = (from_centre + [camera.cx, camera.cy] - uv) * inv_sigma
+    weight = np.minimum(1.0, _REFINEMENT.delta / np.maximum(np.linalg.norm(r, axis=1), 1e-12))  # Huber's
+    return float(2.0 * (weight[:, None] * r * from_centre * inv_sigma).sum())
 
 
 def _refined_with(problem: WindowProblem, camera: Camera, log_scale: float) -> WindowResult:
