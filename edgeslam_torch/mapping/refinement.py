@@ -15,6 +15,7 @@ from edgeslam_torch.mapping.freed_depths import Weight, motion_priors
 from edgeslam_torch.mapping.motion_terms import EFFECTIVE_SAMPLES, motion_factors
 from edgeslam_torch.mapping.prior_anchors import depth_priors, mostly_on_priors
 from edgeslam_torch.mapping.window_edges import WindowEdges
+from edgeslam_torch.mapping.window_scale import MIN_EXTENT, with_same_depths, with_same_way
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import (
     LmConfig,
@@ -24,7 +25,6 @@ from edgeslam_torch.optim.problem import (
     WindowProblem,
     WindowResult,
 )
-from edgeslam_torch.optim.unit import MIN_EXTENT, with_same_depths, with_same_way
 from edgeslam_torch.types import IntArray
 
 UNKNOWN_SCALE_LOG = 1.0

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.frontend.corners import Junctions, detect_junctions
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.optim.edge_association import EdgeField, associate_edges, edge_field, nearest_edges
+from edgeslam_torch.mapping.edge_association import EdgeField, associate_edges, edge_field, nearest_edges
 from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms
 from edgeslam_torch.types import Edges, FloatArray, IntArray
 

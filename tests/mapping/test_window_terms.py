@@ -8,6 +8,7 @@ import pytest
 
 from edgeslam_torch.frontend.corners import Junctions
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.edge_association import edge_field
 from edgeslam_torch.mapping.window_terms import (
     Structure,
     TermConfig,
@@ -17,7 +18,6 @@ from edgeslam_torch.mapping.window_terms import (
     make_structure,
     nearest_poses,
 )
-from edgeslam_torch.optim.edge_association import edge_field
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, WindowProblem
 from edgeslam_torch.types import Edges, FloatArray

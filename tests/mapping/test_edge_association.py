@@ -7,7 +7,7 @@ import torch
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses.edge_alignment import EdgeAlignmentLoss
-from edgeslam_torch.optim.edge_association import EdgeField, EdgePairs, associate_edges, edge_field, nearest_edges
+from edgeslam_torch.mapping.edge_association import EdgeField, EdgePairs, associate_edges, edge_field, nearest_edges
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import EdgeTerms, LmConfig, WindowProblem
 from edgeslam_torch.types import Edges, FloatArray
