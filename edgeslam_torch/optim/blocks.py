@@ -37,10 +37,21 @@ class Normal:
     W: FloatArray
     """``(S, m, 6)`` couplings with poses, see `Links`."""
     cost: float
-    r: FloatArray
-    """Whitened residuals in the caller's order ``(n, k)``, without depth priors."""
-    front: NDArray[np.bool_]
-    """``(n,)`` which lie in front of the camera."""
+    by_block: tuple[FloatArray, NDArray[np.bool_]]
+    """Whitened residuals ``(n, k)``, without depth priors, and which lie in front of the camera ``(n,)``; sorted by
+    block."""
+    order: IntArray
+    """``(n,)`` number of each in the caller's order."""
+
+    @property
+    def r(self) -> FloatArray:
+        """Whitened residuals in the caller's order ``(n, k)``."""
+        return _unsorted(self.by_block[0], self.order)
+
+    @property
+    def front(self) -> NDArray[np.bool_]:
+        """Which lie in front of the camera, in the caller's order ``(n,)``."""
+        return _unsorted(self.by_block[1], self.order)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +118,7 @@ class Anchors:
             cost += accumulate(r_known, J, f, far, True, *kernel, known.anchor, known.column, self.slots[1], *to)
         poses = np.arange(self.free)
         add_blocks(H, poses, poses, own)
-        return Normal(V, g_x, W, cost, _unsorted(r, self.order), _unsorted(front, self.order))
+        return Normal(V, g_x, W, cost, (r, front), self.order)
 
     def moved(self, T_c_w: FloatArray, x: FloatArray, step: FloatArray) -> FloatArray:
         """See `Blocks`; a step is linear in the inverse depth from the first camera that sees the anchor.
@@ -208,7 +219,7 @@ class Hosted:
         g = g.reshape(-1, 6)
         np.add.at(g, target[target >= 0], g_view[target >= 0])
         np.add.at(g, host[host >= 0], -(g_view[:, None] @ Ad)[host >= 0, 0])
-        return Normal(V, g_x, W, cost, _unsorted(r, self.order), _unsorted(front, self.order))
+        return Normal(V, g_x, W, cost, (r, front), self.order)
 
     def moved(self, T_c_w: FloatArray, x: FloatArray, step: FloatArray) -> FloatArray:
         """See `Blocks`."""

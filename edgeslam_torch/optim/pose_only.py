@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.optim.kernels.pose import pose_equations
-from edgeslam_torch.optim.priors import inverse_left_jacobian, pose_prior_residual
+from edgeslam_torch.optim.kernels.tangents import logs
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray
 
@@ -213,8 +213,7 @@ class _Points:
         points = self.p_w, self.uv, self.inv_sigma, self.slack, self.K, self.use
         H, g, cost, self.chi2 = pose_equations(T, *points, robust, config.chi2, config.min_depth)
         if self.prior is not None:
-            e = pose_prior_residual(T, self.prior)
-            J = inverse_left_jacobian(e)
+            (e,), (J,) = logs((T @ se3.inverse(np.asarray(self.prior.T_c_w, dtype=np.float64)))[None])
             H += J.T @ self.prior.information @ J
             g += J.T @ (self.prior.information @ e)
             cost += float(e @ self.prior.information @ e)

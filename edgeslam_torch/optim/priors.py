@@ -1,65 +1,53 @@
 """Priors on poses and scale as residuals of the window."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.optim.problem import PosePrior, RelativePosePrior, ScalePrior
+from edgeslam_torch.optim.blocks import add_blocks
+from edgeslam_torch.optim.kernels.tangents import logs
+from edgeslam_torch.optim.problem import RelativePosePrior, ScalePrior
 from edgeslam_torch.types import FloatArray, IntArray
-
-_BERNOULLI = (-0.5, 1.0 / 12.0, 0.0, -1.0 / 720.0, 0.0, 1.0 / 30240.0)
-"""B_n / n! for n = 1..6, the series of the inverse left Jacobian."""
 
 
 class PriorTerms:
-    """Pose and scale priors of one window; adds itself to the normal equations."""
+    """Priors on relative poses and on the scale of one window; adds itself to the normal equations."""
 
-    def __init__(
-        self,
-        poses: tuple[PosePrior, ...],
-        scales: tuple[ScalePrior, ...],
-        column: IntArray,
-        relative: tuple[RelativePosePrior, ...] = (),
-    ) -> None:
+    def __init__(self, relative: Sequence[RelativePosePrior], scales: Sequence[ScalePrior], column: IntArray) -> None:
         """Prepare the terms.
 
         Args:
-            poses: Pose priors.
+            relative: Priors on relative poses.
             scales: Priors on distances between camera centres.
             column: Free-pose number of each pose, -1 for a fixed one.
-            relative: Priors on relative poses.
         """
-        self.poses = [p for p in poses if column[p.pose] >= 0]
-        self.relative = [p for p in relative if column[p.pose_i] >= 0 or column[p.pose_j] >= 0]
-        self.scales = [p for p in scales if column[p.pose_i] >= 0 or column[p.pose_j] >= 0]
         self.column = column
+        relative = [p for p in relative if column[p.pose_i] >= 0 or column[p.pose_j] >= 0]
+        self.i, self.j = (np.array([getattr(p, k) for p in relative], dtype=np.int64) for k in ("pose_i", "pose_j"))
+        self.expected = np.array([p.T_j_i for p in relative], dtype=np.float64).reshape(-1, 4, 4)
+        self.information = np.array([p.information for p in relative], dtype=np.float64).reshape(-1, 6, 6)
+        self.scales = [p for p in scales if column[p.pose_i] >= 0 or column[p.pose_j] >= 0]
 
     def linearise(self, T: FloatArray, H: FloatArray, g: FloatArray) -> float:
         """Add the terms at poses ``(W, 4, 4)`` to ``H (6F, 6F)`` and ``g (6F,)``; returns their cost."""
         total = 0.0
-        for prior in self.poses:
-            r = pose_prior_residual(T[prior.pose], prior)
-            J = inverse_left_jacobian(r)
-            k = 6 * self.column[prior.pose]
-            H[k : k + 6, k : k + 6] += J.T @ prior.information @ J
-            g[k : k + 6] += J.T @ (prior.information @ r)
-            total += float(r @ prior.information @ r)
-        for relation in self.relative:
-            r, by_i, by_j = relative_prior(T[relation.pose_i], T[relation.pose_j], relation)
-            total += float(r @ relation.information @ r)
-            blocks = [(relation.pose_i, by_i), (relation.pose_j, by_j)]
-            free = [(slice(6 * k, 6 * k + 6), J) for pose, J in blocks if (k := self.column[pose]) >= 0]
-            for rows, J in free:
-                weighted = J.T @ relation.information
-                g[rows] += weighted @ r
-                for columns, other in free:
-                    H[rows, columns] += weighted @ other
+        if len(self.i):
+            r, J_i, J_j = relative_priors(T[self.i], T[self.j], self.expected)
+            slope = (self.information @ r[:, :, None])[:, :, 0]
+            total += float((r * slope).sum())
+            sides = [(self.column[self.i], np.swapaxes(J_i, 1, 2)), (self.column[self.j], np.swapaxes(J_j, 1, 2))]
+            for row, J_t in sides:
+                free, weighted = row >= 0, J_t @ self.information
+                np.add.at(g.reshape(-1, 6), row[free], (J_t @ slope[:, :, None])[free, :, 0])
+                for column, other_t in sides:
+                    add_blocks(H, row, column, weighted @ np.swapaxes(other_t, 1, 2))
         for scale in self.scales:
-            r_s, J_i, J_j = scale_prior(T[scale.pose_i], T[scale.pose_j], scale)
+            r_s, by_i, by_j = scale_prior(T[scale.pose_i], T[scale.pose_j], scale)
             total += r_s**2
             row = np.zeros(len(g))
-            for pose, J in ((scale.pose_i, J_i), (scale.pose_j, J_j)):
+            for pose, J in ((scale.pose_i, by_i), (scale.pose_j, by_j)):
                 k = 6 * self.column[pose]
                 if k >= 0:
                     row[k : k + 6] += J
@@ -68,33 +56,15 @@ class PriorTerms:
         return total
 
 
-def pose_prior_residual(T_c_w: np.ndarray, prior: PosePrior) -> np.ndarray:
-    """Tangent ``(6,)`` that takes the prior's pose to ``T_c_w`` from the left."""
-    return se3.log(T_c_w @ se3.inverse(np.asarray(prior.T_c_w, dtype=np.float64)))
+def relative_priors(T_i: FloatArray, T_j: FloatArray, T_j_i: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Tangents ``(n, 6)`` from expected relative poses to ``T_j T_i^-1``, and their derivatives ``(n, 6, 6)`` by the
+    left tangents of ``T_i`` and of ``T_j``, all ``(n, 4, 4)``."""
+    actual = T_j @ se3.inverse(T_i)
+    r, J = logs(actual @ se3.inverse(T_j_i))
+    return r, -J @ se3.adjoint(actual), J
 
 
-def inverse_left_jacobian(xi: np.ndarray) -> np.ndarray:
-    """``(6, 6)`` with ``log(exp(d) exp(xi)) = xi + J d``; series, for rotations below a radian."""
-    ad = np.zeros((6, 6))
-    ad[:3, :3] = ad[3:, 3:] = se3.hat(xi[3:])
-    ad[:3, 3:] = se3.hat(xi[:3])
-    J, power = np.eye(6), np.eye(6)
-    for coefficient in _BERNOULLI:
-        power = power @ ad
-        if coefficient:
-            J += coefficient * power
-    return J
-
-
-def relative_prior(T_i: np.ndarray, T_j: np.ndarray, prior: RelativePosePrior) -> tuple[np.ndarray, ...]:
-    """Tangent ``(6,)`` from the expected relative pose to ``T_j T_i^-1``, and its derivatives by both left tangents."""
-    T_j_i = T_j @ se3.inverse(T_i)
-    r = se3.log(T_j_i @ se3.inverse(np.asarray(prior.T_j_i, dtype=np.float64)))
-    J = inverse_left_jacobian(r)
-    return r, -J @ se3.adjoint(T_j_i), J
-
-
-def scale_prior(T_i: np.ndarray, T_j: np.ndarray, prior: ScalePrior) -> tuple[float, np.ndarray, np.ndarray]:
+def scale_prior(T_i: FloatArray, T_j: FloatArray, prior: ScalePrior) -> tuple[float, FloatArray, FloatArray]:
     """Whitened log of distance over expected distance; its derivatives ``(6,)`` by both left tangents."""
     R_i, R_j = T_i[:3, :3], T_j[:3, :3]
     between = R_j.T @ T_j[:3, 3] - R_i.T @ T_i[:3, 3]  # c_i - c_j

@@ -209,7 +209,6 @@ class WindowProblem:
     """``(M,)`` inverse standard deviation of a keypoint [1/px], from its octave."""
     K: tuple[float, float, float, float]
     """fx, fy, cx, cy [px]."""
-    pose_priors: tuple[PosePrior, ...] = ()
     relative_priors: tuple[RelativePosePrior, ...] = ()
     scale_priors: tuple[ScalePrior, ...] = ()
     depth_priors: DepthPriors | None = None

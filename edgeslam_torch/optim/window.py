@@ -51,7 +51,7 @@ class Window:
         fixed = np.asarray(problem.pose_fixed, dtype=bool)
         column = np.where(fixed, -1, np.cumsum(~fixed) - 1)
         self.free = np.flatnonzero(~fixed)
-        self.priors = PriorTerms(problem.pose_priors, problem.scale_priors, column, problem.relative_priors)
+        self.priors = PriorTerms(problem.relative_priors, problem.scale_priors, column)
         self.motion = MotionTerms(problem.centres, problem.gravity, problem.headings, column)
         rows = _modules() if config.solver == "modules" else compiled
         self.anchors = Anchors(problem, column, config, rows)

@@ -20,7 +20,6 @@ from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import (
     DepthPriors,
     LmConfig,
-    PosePrior,
     ScalePrior,
     StopReason,
     WindowProblem,
@@ -276,16 +275,6 @@ def test_depth_priors_set_the_scale(rng):
     assert np.median(ratio) == pytest.approx(1.0, abs=0.06)
     assert result.rank_deficiency == 0
     assert len(result.chi2) == len(window.problem.uv)
-
-
-def test_pose_prior_constrains_an_unobserved_pose():
-    window = points_only(seeded_window(15, replace(SMALL, fixed=0)))
-    priors = tuple(PosePrior(i, window.T_c_w[i], 1e8 * np.eye(6)) for i in (0, 5))
-    result = refine_window(replace(window.problem, pose_priors=priors), TIGHT)
-    assert result.rank_deficiency == 0
-    assert pose_error(result, window) < 0.02
-    for i in (0, 5):
-        np.testing.assert_allclose(result.T_c_w[i], window.T_c_w[i], atol=1e-3)
 
 
 # -- degenerate windows ---------------------------------------------------------------------------------------

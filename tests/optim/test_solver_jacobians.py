@@ -7,7 +7,8 @@ from torch import Tensor
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry import se3_torch as lie
-from edgeslam_torch.optim.priors import inverse_left_jacobian, scale_prior
+from edgeslam_torch.optim.kernels.tangents import logs
+from edgeslam_torch.optim.priors import scale_prior
 from edgeslam_torch.optim.problem import ScalePrior
 
 POSES = {
@@ -49,13 +50,20 @@ def test_relative_tangent_is_target_minus_adjoint_times_host(T, rng):
     torch.testing.assert_close(moved, predicted, rtol=0, atol=1e-11)
 
 
-def test_inverse_left_jacobian_by_differences(rng):
+@pytest.mark.parametrize("axis", [*np.eye(3), *-np.eye(3), np.ones(3)], ids=str)
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.0, 3.0])
+def test_logs_invert_exp(rng, axis, angle):
+    xi = np.concatenate((rng.normal(size=3), angle * axis / np.linalg.norm(axis)))
+    np.testing.assert_allclose(logs(se3.exp(xi)[None])[0][0], xi, atol=1e-9)
+
+
+def test_derivative_of_logs_by_differences(rng):
     xi = 0.4 * rng.normal(size=6)
     step = 1e-6
     numeric = np.stack(
         [(se3.log(se3.exp(step * e) @ se3.exp(xi)) - se3.log(se3.exp(-step * e) @ se3.exp(xi))) for e in np.eye(6)], 1
     ) / (2 * step)
-    np.testing.assert_allclose(inverse_left_jacobian(xi), numeric, atol=1e-6)  # the series ends at xi^7
+    np.testing.assert_allclose(logs(se3.exp(xi)[None])[1][0], numeric, atol=1e-6)  # the series ends at xi^7
 
 
 def test_scale_prior_by_differences(rng):

@@ -75,34 +75,39 @@ def accumulate(
         W: ``(S, m, 6)`` couplings of blocks and poses, added to.
     """
     n, rows, m = len(r), r.shape[1], J.shape[2] - 6
-    cost = 0.0
+    cost, weights = 0.0, np.zeros(rows + 1)  # the last one stays zero: a partner for an odd row
     for e in range(n):
-        joint_square = 0.0
+        square = 0.0
         for k in range(rows):
-            joint_square += r[e, k] * r[e, k]
-        for k in range(rows):
-            square = joint_square if joint else r[e, k] * r[e, k]
+            square = square + r[e, k] * r[e, k] if joint else r[e, k] * r[e, k]
+            weights[k] = 0.0
+            if joint and k + 1 < rows:
+                continue
             counts = front[e] and square < far[e]
             value, weight = rho(square if counts else far[e], kernel, delta)
-            if k == 0 or not joint:
-                cost += value
-            if not counts:
+            cost += value
+            for i in range(0 if joint else k, k + 1):
+                weights[i] = weight if counts else 0.0
+        b, v, s = block[e], view[e], slot[e]
+        for k in range(0, rows, 2):  # two rows at once: a sum in memory is read and written half as often
+            l = min(k + 1, rows - 1)
+            w, u = weights[k], weights[k + 1]
+            if w == 0.0 and u == 0.0:
                 continue
-            b, v, s = block[e], view[e], slot[e]
             for i in range(m):
-                slope = weight * J[e, k, 6 + i]
-                g[b, i] += slope * r[e, k]
+                p, q = w * J[e, k, 6 + i], u * J[e, l, 6 + i]
+                g[b, i] += p * r[e, k] + q * r[e, l]
                 for j in range(m):
-                    V[b, i, j] += slope * J[e, k, 6 + j]
+                    V[b, i, j] += p * J[e, k, 6 + j] + q * J[e, l, 6 + j]
                 if v >= 0:
                     for j in range(6):
-                        W[s, i, j] += slope * J[e, k, j]
+                        W[s, i, j] += p * J[e, k, j] + q * J[e, l, j]
             if v >= 0:
                 for i in range(6):
-                    slope = weight * J[e, k, i]
-                    g_pose[v, i] += slope * r[e, k]
+                    p, q = w * J[e, k, i], u * J[e, l, i]
+                    g_pose[v, i] += p * r[e, k] + q * r[e, l]
                     for j in range(6):
-                        H[v, i, j] += slope * J[e, k, j]
+                        H[v, i, j] += p * J[e, k, j] + q * J[e, l, j]
     return cost
 
 

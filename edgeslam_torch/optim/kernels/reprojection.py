@@ -40,13 +40,14 @@ def reprojection(
         whether each is in front of the camera.
     """
     fx, fy, cx, cy = K
-    r, J, front = np.zeros((len(pose), 2)), np.zeros((len(pose), 2, 9)), np.zeros(len(pose), np.bool_)
+    r, J, front = np.zeros((len(pose), 2)), np.empty((len(pose), 2, 9)), np.zeros(len(pose), np.bool_)
     for o in range(len(pose)):
         T, p = T_c_w[pose[o]], p_w[anchor[o]]
         X = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
         Y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
         Z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
         if not Z > MIN_DEPTH:
+            J[o] = 0.0
             continue
         front[o] = True
         iz = 1.0 / Z
@@ -54,9 +55,9 @@ def reprojection(
         a, b = fx * inv_sigma[o], fy * inv_sigma[o]
         r[o, 0] = a * x + (cx - uv[o, 0]) * inv_sigma[o]
         r[o, 1] = b * y + (cy - uv[o, 1]) * inv_sigma[o]
-        J[o, 0, 0], J[o, 0, 2] = a * iz, -a * x * iz
+        J[o, 0, 0], J[o, 0, 1], J[o, 0, 2] = a * iz, 0.0, -a * x * iz
         J[o, 0, 3], J[o, 0, 4], J[o, 0, 5] = -a * x * y, a * (1.0 + x * x), -a * y
-        J[o, 1, 1], J[o, 1, 2] = b * iz, -b * y * iz
+        J[o, 1, 0], J[o, 1, 1], J[o, 1, 2] = 0.0, b * iz, -b * y * iz
         J[o, 1, 3], J[o, 1, 4], J[o, 1, 5] = -b * (1.0 + y * y), b * x * y, b * x
         for i in range(3):
             J[o, 0, 6 + i] = a * iz * (T[0, i] - x * T[2, i])
