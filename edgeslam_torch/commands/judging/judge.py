@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--cells",
         choices=CELLS,
         default="base",
-        help="recordings as they are, their variants, simulations, made telemetry, or all (default: base)",
+        help="recordings as they are, their variants, simulations, a made telemetry or IMU, or all (default: base)",
     )
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of every cell (default: 1)")
     parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="of those runs (default: 0)")
