@@ -111,5 +111,5 @@ def _misfit(gyroscope: FloatArray, camera: FloatArray, dt: FloatArray) -> float:
 
 def _fitted(gyroscope: FloatArray, camera: FloatArray) -> FloatArray:
     """Rotation from camera to IMU axes that fits best (Wahba)."""
-    U, _, Vt = np.linalg.svd(gyroscope.T @ camera)
+    U, _, Vt = np.linalg.svd((gyroscope - gyroscope.mean(axis=0)).T @ (camera - camera.mean(axis=0)))  # without bias
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
