@@ -1,0 +1,391 @@
+r"""Scale, gravity, velocities and biases from visual poses beside an IMU: one maximum a posteriori estimate.
+
+Nodes some 0.2 s apart have a rotation, position, velocity and biases of the IMU in metres, in the map's axes; common to
+all are the log of metres per map unit, gravity, and the camera on the IMU. Pre-integrated readings relate successive
+nodes (`preintegration`), biases walk, and the poses of the images are observed with an error :math:`e` that is
+correlated in time,
+
+.. math:: e_{k+1} = \rho_k e_k + \epsilon, \quad \rho_k = \exp(-\Delta t / \tau), \quad
+    \epsilon \sim N(0, \sigma^2 (1 - \rho_k^2)):
+
+with independent errors the stated scale would be too certain by half, with a random walk the shape of the whole way
+would say nothing. The errors' size is estimated along with the states. Gauss-Newton; the nodes form a band, which is
+eliminated.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.estimation.preintegration import Preintegrated, preintegrate
+from edgeslam_torch.geometry.se3 import hat
+from edgeslam_torch.imu import ImuModel, ImuReadings
+from edgeslam_torch.types import FloatArray
+
+GRAVITY_M_S2 = 9.81
+"""Between 9.78 and 9.83 on the ground; the scale inherits the difference."""
+CORRELATED_S = 0.5
+"""Correlation time of the errors of visual poses: those of a real drone's flight grow with the root of time up to
+about a second, the time between keyframes, and hardly beyond."""
+SYSTEMATIC_LOG = 0.005
+"""Error of the scale by accelerometer gain and axes, which averaging does not reduce (ADIS16448: 0.5 % of span)."""
+LEAST_NODES = 8
+"""Minimum number of nodes: 1.5 s."""
+_STEPS = 12
+_CONVERGED = 0.02
+"""Change of the log scale in sigmas at which the iteration ends."""
+_OUTLIER = 4.0
+"""Error of one pose (6 numbers) from which on it counts linearly [standard deviations]: one in a hundred."""
+_BIAS_SIGMA = np.repeat([0.1, 0.3], 3)
+"""Standard deviation of the biases at power-on [rad/s, m/s^2]: the larger one of cheap sensors, 30 mg."""
+_FLOOR_RAD, _FLOOR_SHARE = 1e-4, 1e-4
+"""Least standard deviation of visual rotations, and of positions as a share of the extent of the way."""
+_UNKNOWN_MOUNT_RAD, _UNKNOWN_LEVER_M, _UNKNOWN_OFFSET_S = 0.1, 0.1, 0.02
+"""Standard deviation of what the model does not say, after `imu_mount`: a camera and an IMU on one small drone."""
+_KNOWN_MOUNT_RAD, _KNOWN_LEVER_M, _KNOWN_OFFSET_S = 1e-3, 2e-3, 2e-4
+"""Standard deviation of what a calibration says."""
+_NODE, _COMMON = 15, 10
+_SCALE, _GRAVITY, _MOUNT, _LEVER, _OFFSET = 0, slice(1, 3), slice(3, 6), slice(6, 9), 9
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Estimate of one flight's last seconds. Node arrays are at the stamps of images."""
+
+    stamps_s: FloatArray
+    """``(N,)``"""
+    R_m_i: FloatArray
+    """``(N, 3, 3)`` IMU to map."""
+    p_m_i: FloatArray
+    """``(N, 3)`` IMU in the map's axes [m]."""
+    velocity: FloatArray
+    """``(N, 3)`` in the map's axes [m/s]."""
+    bias: FloatArray
+    """``(N, 6)`` of gyroscope and accelerometer [rad/s, m/s^2]."""
+    log_scale: float
+    """Log of metres per map unit."""
+    gravity: FloatArray
+    """``(3,)`` in the map's axes, downwards [m/s^2]."""
+    R_i_c: FloatArray
+    """``(3, 3)`` camera to IMU."""
+    t_i_c: FloatArray
+    """``(3,)`` camera in the IMU's axes [m]."""
+    offset_s: float
+    """``t_imu = t_cam + offset``"""
+    covariance: FloatArray
+    """``(10, 10)`` of log scale, gravity's direction (2) [rad], mount (3) [rad], lever (3) [m], offset [s]."""
+    sigma_pose: tuple[float, float]
+    """Standard deviations of the errors of visual poses [rad, map units]."""
+
+    @property
+    def sigma_log_scale(self) -> float:
+        """Standard deviation of the log scale."""
+        return math.hypot(math.sqrt(self.covariance[_SCALE, _SCALE]), SYSTEMATIC_LOG)
+
+    @property
+    def sigma_up_rad(self) -> float:
+        """Standard deviation of the vertical per axis."""
+        return math.sqrt(0.5 * float(np.trace(self.covariance[_GRAVITY, _GRAVITY])))
+
+    @property
+    def sigma_offset_s(self) -> float:
+        """Standard deviation of the time offset."""
+        return math.sqrt(self.covariance[_OFFSET, _OFFSET])
+
+    @property
+    def sigma_mount_rad(self) -> float:
+        """Standard deviation of the camera's rotation on the IMU per axis."""
+        return math.sqrt(float(np.trace(self.covariance[_MOUNT, _MOUNT])) / 3.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Observed:
+    """What an alignment is fitted to."""
+
+    stamps_s: FloatArray
+    R_m_c: FloatArray
+    z: FloatArray
+    """Camera centres ``(N, 3)`` [map units]."""
+    readings: ImuReadings
+    model: ImuModel
+    start: Alignment
+    """Of `R_i_c`, `t_i_c` and `offset_s`, the prior mean."""
+
+
+def align(
+    stamps_s: FloatArray,
+    T_m_c: FloatArray,
+    readings: ImuReadings,
+    model: ImuModel,
+    mount: tuple[FloatArray, float],
+    before: Alignment | None = None,
+) -> Alignment | None:
+    """Align visual poses with inertial readings.
+
+    Args:
+        stamps_s: Increasing stamps of images ``(N,)``, about 0.2 s apart.
+        T_m_c: Their poses ``(N, 4, 4)`` in one submap.
+        readings: Readings that cover them, on the IMU's clock.
+        model: Noise, and what is known of mount and clock.
+        mount: Rotation camera to IMU ``(3, 3)`` and time offset [s], as known or by `imu_mount`.
+        before: An earlier result in the same map, to start from.
+
+    Returns:
+        The estimate, whether or not its scale is accurate; None if readings do not cover enough nodes, or the
+        iteration fails.
+    """
+    lever = np.zeros(3) if model.T_imu_cam is None else model.T_imu_cam[:3, 3]
+    R_i_c, offset_s = mount
+    if before is not None:
+        R_i_c, offset_s, lever = before.R_i_c, before.offset_s, before.t_i_c
+    noise = model.gyroscope_noise_density, model.accelerometer_noise_density
+    bias = np.zeros(6) if before is None else before.bias[-1]
+    moments = stamps_s + offset_s
+    pre = preintegrate(
+        readings.stamps_s, readings.angular_rate_rad_s, readings.acceleration_m_s2, moments, bias, noise
+    )
+    if len(stamps_s) < LEAST_NODES or not pre.complete.all():
+        return None
+    prior_mount = mount if model.T_imu_cam is None else (model.T_imu_cam[:3, :3], mount[1])
+    prior_lever = np.zeros(3) if model.T_imu_cam is None else model.T_imu_cam[:3, 3]
+    R_m_c, z = T_m_c[:, :3, :3], T_m_c[:, :3, 3]
+    rate = np.stack(
+        [np.interp(moments, readings.stamps_s, readings.angular_rate_rad_s[:, k]) for k in range(3)], axis=1
+    )
+    x = _initial(stamps_s, R_m_c, z, pre, R_i_c, lever, offset_s, before)
+    whiten = np.linalg.inv(np.linalg.cholesky(pre.covariance))
+    walk = np.repeat([model.gyroscope_random_walk, model.accelerometer_random_walk], 3)
+    extent = float(np.sqrt(np.mean(np.sum((z - z.mean(axis=0)) ** 2, axis=1))))
+    if extent <= 0.0:
+        return None
+    floor = _FLOOR_RAD, _FLOOR_SHARE * extent
+    sigma_known = np.array(
+        [
+            *[_UNKNOWN_MOUNT_RAD if model.T_imu_cam is None else _KNOWN_MOUNT_RAD] * 3,
+            *[_UNKNOWN_LEVER_M if model.T_imu_cam is None else _KNOWN_LEVER_M] * 3,
+            _UNKNOWN_OFFSET_S if model.time_offset_s is None else _KNOWN_OFFSET_S,
+        ]
+    )
+    if before is None:
+        x = replace(x, sigma_pose=(3e-3, 0.02 * extent))
+    metric_steps = 4 if before is None else 0
+    for step in range(_STEPS):
+        metric = step < metric_steps
+        apart = np.concatenate(
+            [
+                Rotation.from_matrix(prior_mount[0].T @ x.R_i_c).as_rotvec(),
+                x.t_i_c - prior_lever,
+                [x.offset_s - prior_mount[1]],
+            ]
+        )
+        system = _linearised(x, R_m_c, z, pre, whiten, walk, rate, offset_s, metric)
+        try:
+            by_node, by_all, covariance = _solved(*system, x.bias[0], apart, sigma_known)
+        except (LinAlgError, ValueError):
+            return None
+        x = _moved(x, by_node, by_all, metric)
+        x = replace(x, covariance=covariance, sigma_pose=_error_sizes(x, R_m_c, z, pre.dt_s, floor, offset_s))
+        change = abs(by_all[_SCALE])
+        if not math.isfinite(change) or abs(x.log_scale) > 20.0:
+            return None
+        if step > metric_steps and change < _CONVERGED * math.sqrt(covariance[_SCALE, _SCALE]):
+            break
+    return x
+
+
+def _initial(
+    stamps_s: FloatArray,
+    R_m_c: FloatArray,
+    z: FloatArray,
+    pre: Preintegrated,
+    R_i_c: FloatArray,
+    lever: FloatArray,
+    offset_s: float,
+    before: Alignment | None,
+) -> Alignment:
+    """Gyroscope bias by differences of rotations, gravity by the mean specific force, velocities by differences."""
+    R = R_m_c @ R_i_c.T
+    scale = 1.0 if before is None else math.exp(before.log_scale)
+    bias = np.tile(pre.bias, (len(z), 1))
+    if before is None:
+        apart = Rotation.from_matrix(_T(pre.R) @ _T(R[:-1]) @ R[1:]).as_rotvec()
+        bias[:, :3] += np.linalg.lstsq(pre.by_bias[:, :3, :3].reshape(-1, 3), apart.ravel(), rcond=None)[0]
+        up = np.einsum("kij,kj->i", R[:-1], pre.v)
+        gravity = -GRAVITY_M_S2 * up / np.linalg.norm(up)
+    else:
+        gravity = before.gravity
+    p = scale * z - R @ lever
+    between = np.diff(p, axis=0) / pre.dt_s[:, None]
+    velocity = np.concatenate([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
+    sigma = (1e-2, 1.0) if before is None else before.sigma_pose
+    none = np.zeros((_COMMON, _COMMON))
+    return Alignment(
+        stamps_s, R, p, velocity, bias, math.log(scale), gravity, R_i_c, lever, offset_s, none, sigma
+    )
+
+
+def _errors(
+    x: Alignment, R_m_c: FloatArray, z: FloatArray, offset_s: float, rate: FloatArray | None, metric: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Errors ``(N, 6)`` of the visual poses, rotation in the camera and position in the map's axes, and the IMU's
+    rotation at the moments of the images. ``metric``: in metres, linear in the scale, to start from far away."""
+    late, scale = x.offset_s - offset_s, math.exp(x.log_scale)
+    R = x.R_m_i if rate is None else x.R_m_i @ _exp((rate - x.bias[:, :3]) * late)
+    centre = x.p_m_i + x.velocity * late + R @ x.t_i_c
+    position = centre - scale * z if metric else centre / scale - z
+    return np.concatenate([Rotation.from_matrix(_T(R_m_c) @ R @ x.R_i_c).as_rotvec(), position], axis=1), R
+
+
+def _error_sizes(
+    x: Alignment, R_m_c: FloatArray, z: FloatArray, dt_s: FloatArray, floor: tuple[float, float], offset_s: float
+) -> tuple[float, float]:
+    """Robust standard deviations of the errors of visual poses."""
+    e, _ = _errors(x, R_m_c, z, offset_s, None, metric=False)
+    rho = np.exp(-dt_s / CORRELATED_S)[:, None]
+    new = (e[1:] - rho * e[:-1]) / np.sqrt(1.0 - rho**2)
+    sizes = [1.4826 * float(np.median(np.abs(part))) for part in (new[:, :3], new[:, 3:])]
+    return max(sizes[0], floor[0]), max(sizes[1], floor[1])
+
+
+def _linearised(
+    x: Alignment,
+    R_m_c: FloatArray,
+    z: FloatArray,
+    pre: Preintegrated,
+    whiten: FloatArray,
+    walk: FloatArray,
+    rate: FloatArray,
+    offset_s: float,
+    metric: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Whitened residuals ``(K, 21)`` of the intervals with their derivatives ``(K, 21, 40)`` by both nodes and what is
+    common; and those of the first pose, ``(6,)`` and ``(6, 25)``."""
+    dt, K, N = pre.dt_s, len(pre.dt_s), len(z)
+    first, second, common = np.s_[:_NODE], np.s_[_NODE : 2 * _NODE], 2 * _NODE
+    J, r = np.zeros((K, 21, common + _COMMON)), np.zeros((K, 21))
+    h, I3 = dt[:, None], np.eye(3)
+    R0, R1, v0, v1 = x.R_m_i[:-1], x.R_m_i[1:], x.velocity[:-1], x.velocity[1:]
+    R0_T, by_gravity = _T(R0), GRAVITY_M_S2 * _across(x.gravity)
+    changed = np.einsum("kij,kj->ki", pre.by_bias, x.bias[:-1] - pre.bias)
+    sped = _rotated(R0_T, v1 - v0 - x.gravity * h)
+    went = _rotated(R0_T, np.diff(x.p_m_i, axis=0) - v0 * h - 0.5 * x.gravity * h**2)
+    r[:, :3] = Rotation.from_matrix(_T(pre.R @ _exp(changed[:, :3])) @ R0_T @ R1).as_rotvec()
+    r[:, 3:6] = sped - pre.v - changed[:, 3:6]
+    r[:, 6:9] = went - pre.p - changed[:, 6:]
+    J[:, :3, :3], J[:, :3, 15:18] = -_T(R1) @ R0, I3
+    J[:, 3:6, :3], J[:, 3:6, 6:9], J[:, 3:6, 21:24] = hat(sped), -R0_T, R0_T
+    J[:, 6:9, :3], J[:, 6:9, 3:6], J[:, 6:9, 18:21] = hat(went), -R0_T, R0_T
+    J[:, 6:9, 6:9] = -R0_T * h[:, :, None]
+    J[:, :9, 9:15] = -pre.by_bias
+    J[:, 3:6, common + 1 : common + 3] = -(R0_T @ by_gravity) * h[:, :, None]
+    J[:, 6:9, common + 1 : common + 3] = -0.5 * (R0_T @ by_gravity) * h[:, :, None] ** 2
+    r[:, :9], J[:, :9] = _rotated(whiten, r[:, :9]), whiten @ J[:, :9]
+    weight, six = 1.0 / (walk * np.sqrt(h)), np.arange(6)
+    r[:, 9:15] = weight * np.diff(x.bias, axis=0)
+    J[:, 9 + six, 9 + six], J[:, 9 + six, 24 + six] = -weight, weight
+
+    e, R = _errors(x, R_m_c, z, offset_s, rate, metric)
+    unit = 1.0 if metric else math.exp(-x.log_scale)
+    E, C = np.zeros((N, 6, _NODE)), np.zeros((N, 6, _COMMON))
+    E[:, :3, :3], C[:, :3, _MOUNT] = x.R_i_c.T, I3
+    C[:, :3, _OFFSET] = (rate - x.bias[:, :3]) @ x.R_i_c
+    E[:, 3:, :3], E[:, 3:, 3:6], E[:, 3:, 6:9] = -unit * R @ hat(x.t_i_c), unit * I3, unit * (x.offset_s - offset_s) * I3
+    C[:, 3:, _LEVER], C[:, 3:, _OFFSET] = unit * R, unit * x.velocity
+    C[:, 3:, _SCALE] = -math.exp(x.log_scale) * z if metric else -(e[:, 3:] + z)
+    sigma_r, sigma_t = x.sigma_pose
+    weight = np.repeat([1.0 / sigma_r, math.exp(-x.log_scale) / sigma_t if metric else 1.0 / sigma_t], 3)
+    rho = np.exp(-h / CORRELATED_S)
+    fresh = weight / np.sqrt(1.0 - rho**2)
+    r[:, 15:] = fresh * (e[1:] - rho * e[:-1])
+    fresh, kept = fresh[:, :, None], (fresh * rho)[:, :, None]
+    J[:, 15:, first], J[:, 15:, second] = -kept * E[:-1], fresh * E[1:]
+    J[:, 15:, common:] = fresh * C[1:] - kept * C[:-1]
+    if not metric:  # Huber
+        size = np.linalg.norm(r[:, 15:], axis=1)
+        robust = np.sqrt(_OUTLIER / np.maximum(size, _OUTLIER))[:, None]
+        r[:, 15:] *= robust
+        J[:, 15:] *= robust[:, :, None]
+    return J, r, weight[:, None] * np.concatenate([E[0], C[0]], axis=1), weight * e[0]
+
+
+def _solved(
+    J: FloatArray,
+    r: FloatArray,
+    J_first: FloatArray,
+    r_first: FloatArray,
+    bias: FloatArray,
+    apart: FloatArray,
+    sigma_known: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Gauss-Newton step of nodes ``(N, 15)`` and of what is common ``(10,)``, with the latter's covariance."""
+    n, N = _NODE, len(r) + 1
+    H, g = _T(J) @ J, np.einsum("kij,ki->kj", J, r)
+    own, border, slope = np.zeros((N, n, n)), np.zeros((N, n, _COMMON)), np.zeros((N, n))
+    for nodes, at in ((np.s_[:-1], np.s_[:n]), (np.s_[1:], np.s_[n : 2 * n])):
+        own[nodes] += H[:, at, at]
+        border[nodes] += H[:, at, 2 * n :]
+        slope[nodes] += g[:, at]
+    corner, common = H[:, 2 * n :, 2 * n :].sum(axis=0), g[:, 2 * n :].sum(axis=0)
+    H, g = J_first.T @ J_first, J_first.T @ r_first
+    own[0] += H[:n, :n]
+    border[0] += H[:n, n:]
+    corner += H[n:, n:]
+    slope[0] += g[:n]
+    common = common + g[n:]
+    six = np.arange(9, 15)
+    own[0, six, six] += _BIAS_SIGMA**-2
+    slope[0, 9:] += _BIAS_SIGMA**-2 * bias
+    known = np.arange(3, _COMMON)
+    corner[known, known] += sigma_known**-2
+    common[known] += sigma_known**-2 * apart
+    band = np.zeros((2 * n, n * N))
+    i, j = np.tril_indices(n)
+    band[(i - j)[None], n * np.arange(N)[:, None] + j] = own[:, i, j]
+    i, j = (index.ravel() for index in np.indices((n, n)))
+    coupling = (_T(J[:, :, n : 2 * n]) @ J[:, :, :n])[:, i, j]
+    band[(n + i - j)[None], n * np.arange(N - 1)[:, None] + j] = coupling
+    factor = cholesky_banded(band, lower=True, check_finite=True)
+    border = border.reshape(-1, _COMMON)
+    solved = cho_solve_banded((factor, True), np.column_stack([border, slope.ravel()]))
+    covariance = np.linalg.inv(corner - border.T @ solved[:, :-1])
+    covariance = 0.5 * (covariance + covariance.T)
+    by_all = -covariance @ (common - border.T @ solved[:, -1])
+    return -(solved[:, -1] + solved[:, :-1] @ by_all).reshape(N, n), by_all, covariance
+
+
+def _moved(x: Alignment, by_node: FloatArray, by_all: FloatArray, linear: bool) -> Alignment:
+    """The state after a step; ``linear`` in the scale itself, which must stay positive."""
+    grown = math.log(max(1.0 + by_all[_SCALE], 0.2)) if linear else float(np.clip(by_all[_SCALE], -0.7, 0.7))
+    gravity = x.gravity + GRAVITY_M_S2 * _across(x.gravity) @ by_all[_GRAVITY]
+    return replace(
+        x,
+        R_m_i=x.R_m_i @ _exp(by_node[:, :3]),
+        p_m_i=x.p_m_i + by_node[:, 3:6],
+        velocity=x.velocity + by_node[:, 6:9],
+        bias=x.bias + by_node[:, 9:],
+        log_scale=x.log_scale + grown,
+        gravity=GRAVITY_M_S2 * gravity / np.linalg.norm(gravity),
+        R_i_c=x.R_i_c @ _exp(by_all[_MOUNT]),
+        t_i_c=x.t_i_c + by_all[_LEVER],
+        offset_s=x.offset_s + by_all[_OFFSET],
+    )
+
+
+def _across(direction: FloatArray) -> FloatArray:
+    """Two unit vectors at right angles to a direction, as columns ``(3, 2)``."""
+    return np.linalg.svd(direction[None])[2][1:].T
+
+
+def _exp(rotvec: FloatArray) -> FloatArray:
+    return Rotation.from_rotvec(rotvec).as_matrix()
+
+
+def _T(R: FloatArray) -> FloatArray:
+    return np.swapaxes(R, -1, -2)
+
+
+def _rotated(R: FloatArray, p: FloatArray) -> FloatArray:
+    return np.einsum("kij,kj->ki", R, p)
