@@ -32,9 +32,10 @@ CORRELATED_S = 0.5
 about a second, the time between keyframes, and hardly beyond."""
 SYSTEMATIC_LOG = 0.005
 """Error of the scale by accelerometer gain and axes, which averaging does not reduce (ADIS16448: 0.5 % of span)."""
-LEAST_NODES = 8
-"""Minimum number of nodes: 1.5 s."""
-_STEPS = 12
+LEAST_NODES = 12
+"""Minimum number of nodes, 2.5 s: of fewer, the size of their errors is too uncertain."""
+_STEPS, _METRIC_STEPS = 12, 4
+"""Iterations; the first ones linear in the scale itself, whose start is arbitrary."""
 _CONVERGED = 0.02
 """Change of the log scale in sigmas at which the iteration ends."""
 _OUTLIER = 4.0
@@ -43,6 +44,8 @@ _BIAS_SIGMA = np.repeat([0.1, 0.3], 3)
 """Standard deviation of the biases at power-on [rad/s, m/s^2]: the larger one of cheap sensors, 30 mg."""
 _FLOOR_RAD, _FLOOR_SHARE = 1e-4, 1e-4
 """Least standard deviation of visual rotations, and of positions as a share of the extent of the way."""
+_START_RAD, _START_SHARE = 3e-3, 0.02
+"""The same at the start of the iteration."""
 _UNKNOWN_MOUNT_RAD, _UNKNOWN_LEVER_M, _UNKNOWN_OFFSET_S = 0.1, 0.1, 0.02
 """Standard deviation of what the model does not say, after `imu_mount`: a camera and an IMU on one small drone."""
 _KNOWN_MOUNT_RAD, _KNOWN_LEVER_M, _KNOWN_OFFSET_S = 1e-3, 2e-3, 2e-4
@@ -101,20 +104,6 @@ class Alignment:
         return math.sqrt(float(np.trace(self.covariance[_MOUNT, _MOUNT])) / 3.0)
 
 
-@dataclass(frozen=True, slots=True)
-class _Observed:
-    """What an alignment is fitted to."""
-
-    stamps_s: FloatArray
-    R_m_c: FloatArray
-    z: FloatArray
-    """Camera centres ``(N, 3)`` [map units]."""
-    readings: ImuReadings
-    model: ImuModel
-    start: Alignment
-    """Of `R_i_c`, `t_i_c` and `offset_s`, the prior mean."""
-
-
 def align(
     stamps_s: FloatArray,
     T_m_c: FloatArray,
@@ -137,48 +126,38 @@ def align(
         The estimate, whether or not its scale is accurate; None if readings do not cover enough nodes, or the
         iteration fails.
     """
-    lever = np.zeros(3) if model.T_imu_cam is None else model.T_imu_cam[:3, 3]
-    R_i_c, offset_s = mount
-    if before is not None:
-        R_i_c, offset_s, lever = before.R_i_c, before.offset_s, before.t_i_c
+    if len(stamps_s) < LEAST_NODES:
+        return None
+    known = model.T_imu_cam
+    lever = np.zeros(3) if known is None else known[:3, 3]
+    offset_s = mount[1] if before is None else before.offset_s
     noise = model.gyroscope_noise_density, model.accelerometer_noise_density
     bias = np.zeros(6) if before is None else before.bias[-1]
-    moments = stamps_s + offset_s
-    pre = preintegrate(
-        readings.stamps_s, readings.angular_rate_rad_s, readings.acceleration_m_s2, moments, bias, noise
-    )
-    if len(stamps_s) < LEAST_NODES or not pre.complete.all():
-        return None
-    prior_mount = mount if model.T_imu_cam is None else (model.T_imu_cam[:3, :3], mount[1])
-    prior_lever = np.zeros(3) if model.T_imu_cam is None else model.T_imu_cam[:3, 3]
+    rates, moments = readings.angular_rate_rad_s, stamps_s + offset_s
+    pre = preintegrate(readings.stamps_s, rates, readings.acceleration_m_s2, moments, bias, noise)
     R_m_c, z = T_m_c[:, :3, :3], T_m_c[:, :3, 3]
-    rate = np.stack(
-        [np.interp(moments, readings.stamps_s, readings.angular_rate_rad_s[:, k]) for k in range(3)], axis=1
-    )
-    x = _initial(stamps_s, R_m_c, z, pre, R_i_c, lever, offset_s, before)
+    extent = float(np.sqrt(np.mean(np.sum((z - z.mean(axis=0)) ** 2, axis=1))))
+    if not pre.complete.all() or extent <= 0.0:
+        return None
+    rate = np.stack([np.interp(moments, readings.stamps_s, rates[:, k]) for k in range(3)], axis=1)
+    x = _initial(stamps_s, R_m_c, z, pre, (*mount, lever) if before is None else before, extent)
     whiten = np.linalg.inv(np.linalg.cholesky(pre.covariance))
     walk = np.repeat([model.gyroscope_random_walk, model.accelerometer_random_walk], 3)
-    extent = float(np.sqrt(np.mean(np.sum((z - z.mean(axis=0)) ** 2, axis=1))))
-    if extent <= 0.0:
-        return None
     floor = _FLOOR_RAD, _FLOOR_SHARE * extent
+    unknown = known is None
     sigma_known = np.array(
-        [
-            *[_UNKNOWN_MOUNT_RAD if model.T_imu_cam is None else _KNOWN_MOUNT_RAD] * 3,
-            *[_UNKNOWN_LEVER_M if model.T_imu_cam is None else _KNOWN_LEVER_M] * 3,
-            _UNKNOWN_OFFSET_S if model.time_offset_s is None else _KNOWN_OFFSET_S,
-        ]
+        [_UNKNOWN_MOUNT_RAD if unknown else _KNOWN_MOUNT_RAD] * 3
+        + [_UNKNOWN_LEVER_M if unknown else _KNOWN_LEVER_M] * 3
+        + [_UNKNOWN_OFFSET_S if model.time_offset_s is None else _KNOWN_OFFSET_S]
     )
-    if before is None:
-        x = replace(x, sigma_pose=(3e-3, 0.02 * extent))
-    metric_steps = 4 if before is None else 0
+    metric_steps = _METRIC_STEPS if before is None else 0
     for step in range(_STEPS):
         metric = step < metric_steps
         apart = np.concatenate(
             [
-                Rotation.from_matrix(prior_mount[0].T @ x.R_i_c).as_rotvec(),
-                x.t_i_c - prior_lever,
-                [x.offset_s - prior_mount[1]],
+                Rotation.from_matrix(mount[0].T @ x.R_i_c).as_rotvec(),
+                x.t_i_c - lever,
+                [x.offset_s - mount[1]],
             ]
         )
         system = _linearised(x, R_m_c, z, pre, whiten, walk, rate, offset_s, metric)
@@ -201,30 +180,27 @@ def _initial(
     R_m_c: FloatArray,
     z: FloatArray,
     pre: Preintegrated,
-    R_i_c: FloatArray,
-    lever: FloatArray,
-    offset_s: float,
-    before: Alignment | None,
+    start: Alignment | tuple[FloatArray, float, FloatArray],
+    extent: float,
 ) -> Alignment:
-    """Gyroscope bias by differences of rotations, gravity by the mean specific force, velocities by differences."""
-    R = R_m_c @ R_i_c.T
-    scale = 1.0 if before is None else math.exp(before.log_scale)
+    """State from an earlier result, or from a mount, offset and lever: then the gyroscope's bias by differences of
+    rotations, and gravity by the mean specific force. Velocities by differences of positions."""
     bias = np.tile(pre.bias, (len(z), 1))
-    if before is None:
+    if isinstance(start, Alignment):
+        R_i_c, offset_s, lever = start.R_i_c, start.offset_s, start.t_i_c
+        log_scale, gravity, sigma, R = start.log_scale, start.gravity, start.sigma_pose, R_m_c @ R_i_c.T
+    else:
+        R_i_c, offset_s, lever = start
+        log_scale, sigma, R = 0.0, (_START_RAD, _START_SHARE * extent), R_m_c @ R_i_c.T
         apart = Rotation.from_matrix(_T(pre.R) @ _T(R[:-1]) @ R[1:]).as_rotvec()
         bias[:, :3] += np.linalg.lstsq(pre.by_bias[:, :3, :3].reshape(-1, 3), apart.ravel(), rcond=None)[0]
         up = np.einsum("kij,kj->i", R[:-1], pre.v)
         gravity = -GRAVITY_M_S2 * up / np.linalg.norm(up)
-    else:
-        gravity = before.gravity
-    p = scale * z - R @ lever
+    p = math.exp(log_scale) * z - R @ lever
     between = np.diff(p, axis=0) / pre.dt_s[:, None]
     velocity = np.concatenate([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
-    sigma = (1e-2, 1.0) if before is None else before.sigma_pose
-    none = np.zeros((_COMMON, _COMMON))
-    return Alignment(
-        stamps_s, R, p, velocity, bias, math.log(scale), gravity, R_i_c, lever, offset_s, none, sigma
-    )
+    nothing = np.zeros((_COMMON, _COMMON))
+    return Alignment(stamps_s, R, p, velocity, bias, log_scale, gravity, R_i_c, lever, offset_s, nothing, sigma)
 
 
 def _errors(
@@ -290,9 +266,11 @@ def _linearised(
     e, R = _errors(x, R_m_c, z, offset_s, rate, metric)
     unit = 1.0 if metric else math.exp(-x.log_scale)
     E, C = np.zeros((N, 6, _NODE)), np.zeros((N, 6, _COMMON))
+    late = x.offset_s - offset_s
     E[:, :3, :3], C[:, :3, _MOUNT] = x.R_i_c.T, I3
     C[:, :3, _OFFSET] = (rate - x.bias[:, :3]) @ x.R_i_c
-    E[:, 3:, :3], E[:, 3:, 3:6], E[:, 3:, 6:9] = -unit * R @ hat(x.t_i_c), unit * I3, unit * (x.offset_s - offset_s) * I3
+    E[:, 3:, :3], E[:, 3:, 3:6] = -unit * R @ hat(x.t_i_c), unit * I3
+    E[:, 3:, 6:9] = unit * late * I3
     C[:, 3:, _LEVER], C[:, 3:, _OFFSET] = unit * R, unit * x.velocity
     C[:, 3:, _SCALE] = -math.exp(x.log_scale) * z if metric else -(e[:, 3:] + z)
     sigma_r, sigma_t = x.sigma_pose

@@ -1,0 +1,240 @@
+"""An IMU on the camera: metres per map unit, the vertical, and rotations between frames."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.estimation.inertial_alignment import Alignment, align
+from edgeslam_torch.estimation.preintegration import preintegrate
+from edgeslam_torch.estimation.scale.log_scale import LogScale
+from edgeslam_torch.imu import ImuModel, ImuReadings
+from edgeslam_torch.types import FloatArray
+
+KNOWN_LOG = 0.15
+"""Maximum standard deviation of the log of an observable scale: that of the best depth networks."""
+_NODE_S = 0.18
+"""Minimum time between two poses of an alignment: over a tenth of a second their errors hide the motion."""
+_REACH_S = 60.0
+"""Length of way that a fit in flight takes: a map's scale drifts over longer ones."""
+_REFIT_S, _REFIT_SHARE = 1.0, 0.12
+"""Time between fits, and as a share of the time so far: later fits cost more and change less."""
+_CONTRADICTED_RAD = math.radians(3.0)
+"""Size of the errors of visual rotations beyond which gyroscope and images do not move together; in flight they are
+0.1 to 0.3 degrees."""
+_OFFSET_RANGE_S, _OFFSET_STEP_S = 0.5, 0.005
+_LEAST_RATE_RAD_S = 0.05
+"""Minimum standard deviation of the angular rate about a second axis, from which on it determines a mount: five times
+the noise of visual rates."""
+_LEAST_CORRELATION = 0.8
+"""Minimum correlation of the angular rates of camera and IMU."""
+
+
+class Imu:
+    """Readings of one flight and what they say of its map.
+
+    Args:
+        model: Noise, mount and clock; what it does not say is estimated.
+    """
+
+    def __init__(self, model: ImuModel) -> None:
+        self.model = model
+        self.alignment: Alignment | None = None
+        """Newest alignment with the present submap, whether or not its scale is observable."""
+        self.contradicted = False
+        """Whether readings and images do not move together."""
+        self._parts: list[ImuReadings] = []
+        self._mount: tuple[FloatArray, float] | None = None
+        if model.T_imu_cam is not None and model.time_offset_s is not None:
+            self._mount = model.T_imu_cam[:3, :3], model.time_offset_s
+        self._since_s = self._fitted_s = self._first_s = -math.inf
+
+    def __len__(self) -> int:
+        return sum(map(len, self._parts))
+
+    def add(self, parts: Sequence[ImuReadings]) -> None:
+        """Readings in temporal order; those of an accelerometer alone are not used."""
+        self._parts += [part for part in parts if len(part) and part.has_gyroscope]
+
+    def begin_submap(self, stamp_s: float) -> None:
+        """Poses up to a stamp belong to another submap."""
+        self._since_s, self.alignment = stamp_s, None
+
+    def is_due(self, stamp_s: float) -> bool:
+        """Whether enough time has passed since the last fit."""
+        if not self._parts:
+            return False
+        began_s = max(self._since_s, self._parts[0].stamps_s[0])
+        reach_s = min(_REACH_S, stamp_s - began_s)
+        return stamp_s - self._fitted_s >= max(_REFIT_S, _REFIT_SHARE * reach_s)
+
+    def fit(self, stamps_s: FloatArray, T_m_c: FloatArray, whole: bool = False) -> None:
+        """Align with the poses of images.
+
+        Args:
+            stamps_s: Increasing stamps ``(N,)`` at 10 Hz.
+            T_m_c: Poses ``(N, 4, 4)`` in the present map.
+            whole: Of the whole flight, instead of the last seconds.
+        """
+        if not self._parts or len(stamps_s) == 0:
+            return
+        self._fitted_s = float(stamps_s[-1])
+        reach_s = math.inf if whole else _REACH_S
+        margin_s = _OFFSET_RANGE_S if self._mount is None else abs(self._mount[1])
+        first_s = max(self._since_s, stamps_s[-1] - reach_s, self._parts[0].stamps_s[0] + margin_s)
+        last_s = self._parts[-1].stamps_s[-1] - margin_s
+        used = (stamps_s > first_s) & (stamps_s <= last_s + 1.0 / self.model.rate_hz)
+        stamps_s, T_m_c = stamps_s[used], T_m_c[used]
+        if len(stamps_s) < 2:
+            return
+        readings = self._between(stamps_s[0] - margin_s - 0.1, math.inf)
+        if self._mount is None:
+            self._mount = imu_mount(stamps_s, T_m_c[:, :3, :3], readings, self.model)
+            if self._mount is None:
+                return
+        k = _spaced(stamps_s)
+        found = None if self.alignment is None else self._aligned(stamps_s[k], T_m_c[k], readings, self.alignment)
+        if found is None:  # the second time linearised at the first's biases and offset
+            rough = self._aligned(stamps_s[k], T_m_c[k], readings, None)
+            found = None if rough is None else self._aligned(stamps_s[k], T_m_c[k], readings, rough)
+        self.contradicted = found is not None and found.sigma_pose[0] > _CONTRADICTED_RAD
+        self.alignment = None if self.contradicted else found
+
+    def _aligned(
+        self, stamps_s: FloatArray, T_m_c: FloatArray, readings: ImuReadings, before: Alignment | None
+    ) -> Alignment | None:
+        assert self._mount is not None
+        return align(stamps_s, T_m_c, readings, self.model, self._mount, before)
+
+    @property
+    def scale(self) -> LogScale | None:
+        """Metres per map unit; None while it is not observable."""
+        found = self.alignment
+        if found is None or not found.sigma_log_scale < KNOWN_LOG:
+            return None
+        return LogScale(found.log_scale, found.sigma_log_scale, "imu")
+
+    @property
+    def up(self) -> tuple[FloatArray, float] | None:
+        """The vertical ``(3,)`` in the map, and its standard deviation per axis [rad]."""
+        found = self.alignment
+        return None if found is None else (-found.gravity / np.linalg.norm(found.gravity), found.sigma_up_rad)
+
+    def turned(self, from_s: float, to_s: float) -> FloatArray | None:
+        """Rotation ``R_c1_c0`` ``(3, 3)`` of the camera between two frames; None without readings or mount."""
+        found = self.alignment
+        if found is None:
+            return None
+        readings = self._between(from_s + found.offset_s - 0.05, to_s + found.offset_s + 0.05)
+        if len(readings) < 2:
+            return None
+        moments = np.array([from_s, to_s]) + found.offset_s
+        felt = preintegrate(
+            readings.stamps_s,
+            readings.angular_rate_rad_s,
+            readings.acceleration_m_s2,
+            moments,
+            found.bias[-1],
+            (self.model.gyroscope_noise_density, self.model.accelerometer_noise_density),
+        )
+        return found.R_i_c.T @ felt.R[0].T @ found.R_i_c if felt.complete[0] else None
+
+    def _between(self, after_s: float, until_s: float) -> ImuReadings:
+        """Readings of a time."""
+        first = len(self._parts)
+        while first > 0 and self._parts[first - 1].stamps_s[-1] > after_s:
+            first -= 1
+        return ImuReadings.joined(self._parts[max(first - 1, 0) :]).between(after_s, until_s)
+
+    def warnings(self) -> list[str]:
+        """What could not be determined, and why."""
+        if not self._parts:
+            return []
+        if self.contradicted:
+            return [
+                "the IMU contradicts the images' rotations and is not used: is it of this recording, in rad/s, with "
+                "the axes of its T_imu_cam?"
+            ]
+        if self._mount is None:
+            return [
+                "the camera's rotation on the IMU is not observable yet: turn about two axes, or give T_imu_cam and "
+                "time_offset_s"
+            ]
+        return [] if self.scale is not None else ["the scale is not observable from the IMU yet: it needs acceleration"]
+
+    def statistics(self) -> dict[str, float]:
+        """The newest alignment, for the report."""
+        numbers: dict[str, float] = {"imu readings": len(self)}
+        if (found := self.alignment) is not None:
+            unit = math.exp(found.log_scale)
+            numbers |= {
+                "scale imu": unit,
+                "scale imu sigma": unit * found.sigma_log_scale,
+                "imu time offset s": found.offset_s,
+                "imu time offset sigma s": found.sigma_offset_s,
+                "imu mount sigma deg": math.degrees(found.sigma_mount_rad),
+                "imu visual error rad": found.sigma_pose[0],
+                "imu visual error m": unit * found.sigma_pose[1],
+            }
+        return numbers
+
+
+def _spaced(stamps_s: FloatArray) -> list[int]:
+    """Indices of poses that are `_NODE_S` apart; the last one always."""
+    chosen = [len(stamps_s) - 1]
+    for k in range(len(stamps_s) - 2, -1, -1):
+        if stamps_s[chosen[-1]] - stamps_s[k] >= _NODE_S:
+            chosen.append(k)
+    return chosen[::-1]
+
+
+def imu_mount(
+    stamps_s: FloatArray, R_m_c: FloatArray, readings: ImuReadings, model: ImuModel
+) -> tuple[FloatArray, float] | None:
+    """Rotation camera to IMU ``(3, 3)`` and time offset [s] by correlating angular rates.
+
+    Args:
+        stamps_s: Increasing stamps of images ``(N,)``.
+        R_m_c: Rotations of the camera ``(N, 3, 3)``.
+        readings: Readings.
+        model: What is known.
+
+    Returns:
+        None if the motion does not determine them: there must be rotation about two axes that both sensors see.
+    """
+    dt = np.diff(stamps_s)
+    near = dt < 0.3
+    if near.sum() < 10:
+        return None
+    turned = Rotation.from_matrix(np.swapaxes(R_m_c[:-1], 1, 2) @ R_m_c[1:]).as_rotvec()[near] / dt[near, None]
+    turned -= np.median(turned, axis=0)
+    steps = np.diff(readings.stamps_s)[:, None]
+    rate = readings.angular_rate_rad_s
+    angle = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (rate[1:] + rate[:-1]) * steps, axis=0)])
+    given = model.time_offset_s
+    grid = np.arange(-_OFFSET_RANGE_S, _OFFSET_RANGE_S + 1e-9, _OFFSET_STEP_S) if given is None else np.array([given])
+    cost, found = np.full(len(grid), np.inf), []
+    for k, offset_s in enumerate(grid):
+        moments = stamps_s + offset_s
+        at = np.stack([np.interp(moments, readings.stamps_s, angle[:, i]) for i in range(3)], axis=1)
+        felt = (np.diff(at, axis=0) / dt[:, None])[near]
+        felt -= np.median(felt, axis=0)
+        R = (
+            model.T_imu_cam[:3, :3]
+            if model.T_imu_cam is not None
+            else Rotation.align_vectors(felt, turned)[0].as_matrix()
+        )
+        cost[k] = float(np.sum((felt - turned @ R.T) ** 2))
+        found.append((R, felt))
+    best = int(np.argmin(cost))
+    R, felt = found[best]
+    spread = np.linalg.svd(felt, compute_uv=False) / math.sqrt(len(felt))
+    correlation = float(np.sum(felt * (turned @ R.T))) / math.sqrt(float(np.sum(felt**2) * np.sum(turned**2)) + 1e-12)
+    if spread[1] < _LEAST_RATE_RAD_S or correlation < _LEAST_CORRELATION:
+        return None
+    offset_s = float(grid[best])
+    if 0 < best < len(grid) - 1:
+        before, here, after = cost[best - 1 : best + 2]
+        offset_s += 0.5 * _OFFSET_STEP_S * float((before - after) / (before - 2.0 * here + after))
+    return R, offset_s
