@@ -133,7 +133,7 @@ class EdgeSlam:
             executor = ThreadPoolExecutor(1, thread_name_prefix="mapping")
         lm = lm_config(config.window)
         mapper = Mapper(self.map, camera, config, lm, self.edges)
-        fusion = MotionFusion(config.fusion, self._T_b_c, camera.focal_sigma)
+        fusion = MotionFusion(config.fusion, self._T_b_c, camera.focal_sigma, self.imu)
         fusion.refined_poses = self.log.poses
         graph = SubmapGraph(self.map, self.log, fusion.scale, fusion.scale_around, fusion.scale_along)
         self._system = System(
@@ -254,6 +254,7 @@ class EdgeSlam:
         with system.timed("fusion"):
             telemetry, felt = separated(readings)
             self._felt += felt
+            system.fusion.add_imu(felt)
             system.fusion.add_telemetry(telemetry)
             system.has_telemetry = system.has_telemetry or len(telemetry) > 0
         if not self.log.records:
@@ -318,9 +319,14 @@ class EdgeSlam:
         self._calibration_warning = calibration_warning(self.camera, self._shown_keyframes(), self.map.anchors.p_w)
 
     def _find_up(self) -> None:
-        """Determine the vertical: from the drone's attitude, with which the world is aligned already; else from
-        accelerometer and edges, after which the world is rotated, unless its axes are those of a loaded map."""
-        system = self._system
+        """Determine the vertical: by an IMU's alignment; from the drone's attitude, with which the world is aligned
+        already; else from accelerometer and edges, after which the world is rotated, unless its axes are those of a
+        loaded map."""
+        system, felt_up = self._system, self._system.fusion.imu.up
+        if felt_up is not None and not self._earlier.pieces:
+            system.published = system.published.levelled(felt_up[0], np.zeros(3))
+            self.up = Up(np.array([0.0, 0.0, 1.0]), felt_up[1], "imu")
+            return
         if system.published.upright and (not self._earlier.pieces or system.fusion.orientation.began_upright):
             self.up = Up(np.array([0.0, 0.0, 1.0]), self.config.fusion.alignment_sigma_rad, "telemetry")
             return

@@ -236,7 +236,7 @@ class ScaleEstimate:
     sigma: float = np.inf
     """Standard deviation of ``value``; infinite while unknown."""
     source: str = "none"
-    """Sources: ``none``, ``depth``, ``telemetry``, ``height``, or several, joined by ``+``."""
+    """Sources: ``none``, ``depth``, ``telemetry``, ``height``, ``imu``, or several, joined by ``+``."""
 
     @property
     def units(self) -> Units:

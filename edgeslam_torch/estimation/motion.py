@@ -32,6 +32,8 @@ from edgeslam_torch.estimation.prediction import (
 )
 from edgeslam_torch.estimation.remembered import Remembered
 from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
+from edgeslam_torch.estimation.sensors.imu import REACH_S as IMU_REACH_S
+from edgeslam_torch.estimation.sensors.imu import Imu
 from edgeslam_torch.estimation.snapshot import Present, Snapshot
 from edgeslam_torch.estimation.telemetry.comparison import Comparison, FlightSoFar
 from edgeslam_torch.estimation.telemetry.delay import DelaySearch
@@ -42,6 +44,7 @@ from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, Senso
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory, VisualPose
 from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
+from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
 
 _REFIT_S = 1.0
@@ -63,9 +66,12 @@ class MotionFusion:
         config: Settings.
         T_b_c: Camera in the body frame ``(4, 4)`` [m]; for a Tello tilted down by some 12 degrees.
         focal_sigma: Relative standard deviation of the camera's focal length; a wrong one bends the map and its scale.
+        imu: Noise, mount and clock of an IMU; those of a cheap one when None.
     """
 
-    def __init__(self, config: FusionConfig, T_b_c: FloatArray, focal_sigma: float = 0.0) -> None:
+    def __init__(
+        self, config: FusionConfig, T_b_c: FloatArray, focal_sigma: float = 0.0, imu: ImuModel | None = None
+    ) -> None:
         self.config = config
         given = np.asarray(T_b_c, dtype=np.float64)
         self.refined_poses: Callable[[float], tuple[FloatArray, FloatArray]] | None = None
@@ -79,6 +85,7 @@ class MotionFusion:
         )
         self.orientation = Orientation(self.flight, given)
         self.metres = ScaleEstimator(config, focal_sigma)
+        self.imu = Imu(ImuModel() if imu is None else imu)
         self._comparison = Comparison(config)
         self._filter = FilterFeed(config, given)
         self._convergence = ScaleConvergence()
@@ -96,6 +103,10 @@ class MotionFusion:
             if np.isfinite(sample.rpy_rad).all():
                 self.orientation.note_attitude(sample.stamp_s)
             self._filter.add_telemetry(sample, self.metres.fit.shortfall_m_s)
+
+    def add_imu(self, readings: Sequence[ImuReadings]) -> None:
+        """IMU readings in temporal order."""
+        self.imu.add(readings)
 
     def add_visual(
         self, stamp_s: float, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float, tracked: bool = True
@@ -124,6 +135,9 @@ class MotionFusion:
             self._refit()
         elif self.metres.sensor_scale is not None and stamp_s - max(self._fitted_s, self._followed_s) >= _REFIT_S:
             self._follow_map(stamp_s)
+        if self.imu.is_due(stamp_s):
+            self._remember_refined(stamp_s, IMU_REACH_S)
+            self._fit_imu()
         if self._trust.velocity and self._trust.motion:
             self._filter.see(visual, Metric(self.scale(), self.flight.delay.delay))
         else:
@@ -159,6 +173,13 @@ class MotionFusion:
         """
         self._remember(stamps_s, T_w_c)
         self._refit(flying=False)
+        self._fit_imu(whole=True)
+
+    def _fit_imu(self, whole: bool = False) -> None:
+        """Align the IMU with the stored poses."""
+        shown = self._memory.sightings()
+        self.imu.fit(shown.stamps_s, shown.T, whole)
+        self.metres.inertial = self.imu.scale
 
     def _remember_refined(self, stamp_s: float, reach_s: float) -> None:
         """Update the poses of the last seconds to the present map, and measure the change."""
@@ -182,6 +203,8 @@ class MotionFusion:
     def begin_piece(self) -> None:
         """Begin a submap at a predicted pose: the step between submaps is no motion of the camera."""
         self._filter.clear()
+        if self._memory.last is not None:
+            self.imu.begin_submap(self._memory.last.stamp_s)
         self._memory.interrupt()
 
     # --- output --------------------------------------------------------------------------------------------------
@@ -264,7 +287,8 @@ class MotionFusion:
     def republished(self, published: OutputFrame, centre_map: FloatArray, keep_scale: bool) -> OutputFrame:
         """The published frame, levelled and, unless ``keep_scale``, with the present scale or guess; the
         published position of ``centre_map`` ``(3,)`` stays."""
-        published = published.turned_upright(self.orientation.upright(), centre_map)
+        upright = self.orientation.upright()
+        published = published.turned_upright(self.imu.upright() if upright is None else upright, centre_map)
         if keep_scale:
             return published
         return published.guessed_anew(self.metres.guess, centre_map).revised(self.scale(), centre_map)
@@ -338,12 +362,12 @@ class MotionFusion:
         numbers["video delay sigma s"] = self.flight.delay_sigma_s
         numbers.update({f"agreement {reading}": found.share for reading, found in self._trust.latest.items()})
         numbers["camera mount turned deg"] = math.degrees(self.orientation.mount_turned_rad)
-        return numbers | self.metres.statistics()
+        return numbers | self.metres.statistics() | self.imu.statistics()
 
     def warnings(self) -> list[str]:
         """Warnings of a rejected depth network or rejected telemetry."""
         drift = [] if self._drift is None else [self._drift]
-        return self._trust.warnings() + self._track.warnings() + self.metres.warnings() + drift
+        return self._trust.warnings() + self._track.warnings() + self.metres.warnings() + drift + self.imu.warnings()
 
     def telemetry(self) -> TelemetryModel | None:
         """Present telemetry and its alignment with the map, for refinement; None without any.

@@ -29,7 +29,7 @@ _GUESS_CONTRADICTION, _GUESS_OFF = 1.0, 0.05
 reach 0.16 at best: a guess is replaced as soon as measured metres are probably better, unless the change is
 negligible."""
 
-MEASURED = frozenset({"telemetry", "height"})
+MEASURED = frozenset({"telemetry", "height", "imu"})
 """Sources that measure metres; the depth network has set the initial guess already."""
 
 

@@ -44,9 +44,11 @@ class ScaleEstimator:
         self.guess: ScaleEstimate | None = None
         """Scale by a climb before telemetry is validated; None afterwards. Not metric: only a better initial value of
         the published scale than the depth network's."""
+        self.inertial: LogScale | None = None
+        """Scale by an IMU; None while it is not observable."""
         self._remembered: LogScale | None = None
         self._scale = ScaleEstimate()
-        self._rests_on: tuple[LogScale | None, LogScale | None, DepthScale | None] = (None, None, None)
+        self._rests_on: tuple[LogScale | DepthScale | None, ...] = ()
 
     # --- input ---------------------------------------------------------------------------------------------------
 
@@ -112,7 +114,7 @@ class ScaleEstimator:
 
     def scale(self) -> ScaleEstimate:
         """Metres per map unit with sigma and source; unchanged without new measurements."""
-        rests_on = self._remembered, self.sensor_scale, self._depth.scale()
+        rests_on = self._remembered, self.sensor_scale, self.inertial, self._depth.scale()
         if rests_on != self._rests_on:  # cached, since it is used several times a frame
             self._rests_on, self._scale = rests_on, fuse(self._settled().used)
         return self._scale
@@ -155,7 +157,8 @@ class ScaleEstimator:
     def sources(self) -> tuple[ScaleEstimate, ...]:
         """Scale by each source alone, used or not."""
         measured = [ScaleEstimate(s.value, s.sigma, name) for name, s in self.fit.sources.items()]
-        measured += [_estimate(known) for known in (self.network(), self._remembered) if known is not None]
+        others = self.inertial, self.network(), self._remembered
+        measured += [_estimate(known) for known in others if known is not None]
         return tuple(measured)
 
     def contradiction(self) -> str | None:
@@ -164,7 +167,7 @@ class ScaleEstimator:
 
     def warnings(self) -> list[str]:
         """The same, and a warning of the depth network where its metres are needed."""
-        depth = self._depth.scale() if self.sensor_scale is None else None
+        depth = self._depth.scale() if self.sensor_scale is None and self.inertial is None else None
         own = (None if depth is None else depth.warning(), self.contradiction())
         return [said for said in own if said is not None]
 
@@ -181,6 +184,8 @@ class ScaleEstimator:
         measured, depth = self.sensor_scale, self._depth.scale()
         if measured is not None:
             measured = replace(measured, sigma=math.hypot(measured.sigma, _FOCAL_SHARE * self._focal_sigma))
+        if self.inertial is not None:  # a unit that cannot be mistaken, with a sigma that is below any network's
+            return Settled(tuple(known for known in (self.inertial, measured) if known is not None))
         if self._remembered is not None:  # which includes the network's estimate
             return settled_with_network(measured, self._remembered, True)
         return settled_with_network(measured, self.network(), depth is not None and depth.in_domain)

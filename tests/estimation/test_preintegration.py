@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.estimation.preintegration import Preintegrated, preintegrate
+from edgeslam_torch.estimation.inertial.preintegration import Preintegrated, preintegrate
 
 STAMPS_S = np.arange(0.0, 1.2, 0.005)
 RATE = np.stack([np.sin(3.0 * STAMPS_S + k) for k in range(3)], axis=1)

@@ -6,23 +6,27 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.estimation.inertial_alignment import Alignment, align
-from edgeslam_torch.estimation.preintegration import preintegrate
+from edgeslam_torch.estimation.inertial.alignment import Alignment, align
+from edgeslam_torch.estimation.inertial.preintegration import preintegrate
 from edgeslam_torch.estimation.scale.log_scale import LogScale
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.types import FloatArray
 
 KNOWN_LOG = 0.15
 """Maximum standard deviation of the log of an observable scale: that of the best depth networks."""
+_LEAST_EXCITATION = 3.0
+"""Minimum of `Alignment.excitation` of an observable scale."""
 _NODE_S = 0.18
 """Minimum time between two poses of an alignment: over a tenth of a second their errors hide the motion."""
-_REACH_S = 60.0
+REACH_S = 60.0
 """Length of way that a fit in flight takes: a map's scale drifts over longer ones."""
 _REFIT_S, _REFIT_SHARE = 1.0, 0.12
 """Time between fits, and as a share of the time so far: later fits cost more and change less."""
 _CONTRADICTED_RAD = math.radians(3.0)
 """Size of the errors of visual rotations beyond which gyroscope and images do not move together; in flight they are
 0.1 to 0.3 degrees."""
+_UPRIGHT_RAD = math.radians(1.0)
+"""Maximum standard deviation of a vertical that levels the output."""
 _OFFSET_RANGE_S, _OFFSET_STEP_S = 0.5, 0.005
 _LEAST_RATE_RAD_S = 0.05
 """Minimum standard deviation of the angular rate about a second axis, from which on it determines a mount: five times
@@ -66,7 +70,7 @@ class Imu:
         if not self._parts:
             return False
         began_s = max(self._since_s, self._parts[0].stamps_s[0])
-        reach_s = min(_REACH_S, stamp_s - began_s)
+        reach_s = min(REACH_S, stamp_s - began_s)
         return stamp_s - self._fitted_s >= max(_REFIT_S, _REFIT_SHARE * reach_s)
 
     def fit(self, stamps_s: FloatArray, T_m_c: FloatArray, whole: bool = False) -> None:
@@ -80,7 +84,7 @@ class Imu:
         if not self._parts or len(stamps_s) == 0:
             return
         self._fitted_s = float(stamps_s[-1])
-        reach_s = math.inf if whole else _REACH_S
+        reach_s = math.inf if whole else REACH_S
         margin_s = _OFFSET_RANGE_S if self._mount is None else abs(self._mount[1])
         first_s = max(self._since_s, stamps_s[-1] - reach_s, self._parts[0].stamps_s[0] + margin_s)
         last_s = self._parts[-1].stamps_s[-1] - margin_s
@@ -111,7 +115,7 @@ class Imu:
     def scale(self) -> LogScale | None:
         """Metres per map unit; None while it is not observable."""
         found = self.alignment
-        if found is None or not found.sigma_log_scale < KNOWN_LOG:
+        if found is None or found.excitation < _LEAST_EXCITATION or not found.sigma_log_scale < KNOWN_LOG:
             return None
         return LogScale(found.log_scale, found.sigma_log_scale, "imu")
 
@@ -120,6 +124,12 @@ class Imu:
         """The vertical ``(3,)`` in the map, and its standard deviation per axis [rad]."""
         found = self.alignment
         return None if found is None else (-found.gravity / np.linalg.norm(found.gravity), found.sigma_up_rad)
+
+    def upright(self) -> FloatArray | None:
+        """Rotation ``(3, 3)`` from the map to a world whose z is up, if the vertical is accurate."""
+        if self.up is None or self.up[1] > _UPRIGHT_RAD:
+            return None
+        return Rotation.align_vectors([[0.0, 0.0, 1.0]], [self.up[0]])[0].as_matrix()
 
     def turned(self, from_s: float, to_s: float) -> FloatArray | None:
         """Rotation ``R_c1_c0`` ``(3, 3)`` of the camera between two frames; None without readings or mount."""
@@ -173,6 +183,7 @@ class Imu:
                 "scale imu sigma": unit * found.sigma_log_scale,
                 "imu time offset s": found.offset_s,
                 "imu time offset sigma s": found.sigma_offset_s,
+                "imu excitation": found.excitation,
                 "imu mount sigma deg": math.degrees(found.sigma_mount_rad),
                 "imu visual error rad": found.sigma_pose[0],
                 "imu visual error m": unit * found.sigma_pose[1],

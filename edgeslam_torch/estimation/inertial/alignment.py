@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.estimation.preintegration import Preintegrated, preintegrate
+from edgeslam_torch.estimation.inertial.preintegration import Preintegrated, preintegrate
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.types import FloatArray
@@ -82,6 +82,9 @@ class Alignment:
     """``(10, 10)`` of log scale, gravity's direction (2) [rad], mount (3) [rad], lever (3) [m], offset [s]."""
     sigma_pose: tuple[float, float]
     """Standard deviations of the errors of visual poses [rad, map units]."""
+    excitation: float = 0.0
+    """Root mean square of the changing acceleration between nodes, in standard deviations of the accelerometer's noise:
+    near 1 nothing but noise has moved, and the covariance of the scale means nothing."""
 
     @property
     def sigma_log_scale(self) -> float:
@@ -170,9 +173,13 @@ def align(
         change = abs(by_all[_SCALE])
         if not math.isfinite(change) or abs(x.log_scale) > 20.0:
             return None
+        if not (np.diag(covariance) > 0.0).all():
+            return None
         if step > metric_steps and change < _CONVERGED * math.sqrt(covariance[_SCALE, _SCALE]):
             break
-    return x
+    felt = np.diff(x.velocity, axis=0) / pre.dt_s[:, None]
+    noise_m_s2 = model.accelerometer_noise_density / np.sqrt(pre.dt_s)[:, None]
+    return replace(x, excitation=float(np.sqrt(np.mean(((felt - felt.mean(axis=0)) / noise_m_s2) ** 2))))
 
 
 def _initial(
