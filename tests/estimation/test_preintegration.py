@@ -38,9 +38,9 @@ def test_increments_and_covariance_are_those_of_gtsam(k: int) -> None:
         for _ in range(50):
             theirs.integrateMeasurement(middle.apply(force - BIAS[3:]) + BIAS[3:], rate, dt)
     ours = found()
-    np.testing.assert_allclose(ours.R[k], theirs.deltaRij().matrix(), atol=1e-6)
-    np.testing.assert_allclose(ours.v[k], theirs.deltaVij(), atol=1e-6)
-    np.testing.assert_allclose(ours.p[k], theirs.deltaPij(), atol=1e-6)
+    np.testing.assert_allclose(ours.R[k], theirs.deltaRij().matrix(), atol=1e-5)
+    np.testing.assert_allclose(ours.v[k], theirs.deltaVij(), atol=1e-5)
+    np.testing.assert_allclose(ours.p[k], theirs.deltaPij(), atol=1e-5)
     order = [0, 1, 2, 6, 7, 8, 3, 4, 5]  # theirs: rotation, position, velocity
     sigma = np.sqrt(np.diag(ours.covariance[k]))
     apart = ours.covariance[k] - theirs.preintMeasCov()[np.ix_(order, order)]

@@ -23,8 +23,9 @@ MAX_GAP_S = 0.05
 """Longest time between two readings that is integrated across: ten at 200 Hz. At 1 m/s^2 and 1 rad/s of change in it,
 the velocity is off by 12 mm/s."""
 
-HELD_S = 0.005
-"""Time for which the first and the last reading are held: a period at 200 Hz."""
+HELD_S = 0.011
+"""Time for which the first and the last reading are held, two periods at 200 Hz: the reading of a frame's moment may
+come with the next frame."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.inertial.alignment import Alignment, align
-from edgeslam_torch.estimation.inertial.preintegration import preintegrate
+from edgeslam_torch.estimation.inertial.preintegration import HELD_S, preintegrate
 from edgeslam_torch.estimation.scale.log_scale import LogScale
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.types import FloatArray
@@ -88,7 +88,7 @@ class Imu:
         margin_s = _OFFSET_RANGE_S if self._mount is None else abs(self._mount[1])
         first_s = max(self._since_s, stamps_s[-1] - reach_s, self._parts[0].stamps_s[0] + margin_s)
         last_s = self._parts[-1].stamps_s[-1] - margin_s
-        used = (stamps_s > first_s) & (stamps_s <= last_s + 1.0 / self.model.rate_hz)
+        used = (stamps_s > first_s) & (stamps_s <= last_s + HELD_S)
         stamps_s, T_m_c = stamps_s[used], T_m_c[used]
         if len(stamps_s) < 2:
             return

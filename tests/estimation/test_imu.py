@@ -1,0 +1,147 @@
+"""Scale, vertical, mount and clock from a simulated IMU beside visual poses with correlated errors."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.estimation.inertial.alignment import CORRELATED_S
+from edgeslam_torch.estimation.sensors.imu import Imu
+from edgeslam_torch.imu import ImuModel, ImuReadings
+from edgeslam_torch.synthetic.flights.imu import ADIS16448, MPU6050, mounted, simulate_imu
+
+SCALE = 0.4
+T_IMU_CAM = np.eye(4)
+T_IMU_CAM[:3, :3] = Rotation.from_euler("xyz", [100.0, 5.0, 80.0], degrees=True).as_matrix()
+T_IMU_CAM[:3, 3] = [0.05, -0.02, 0.03]
+UNKNOWN = {"T_imu_cam": None, "time_offset_s": None}
+
+
+@dataclass
+class Flight:
+    stamps_s: np.ndarray
+    T_m_c: np.ndarray
+    """Visual poses in the map."""
+    readings: ImuReadings
+    up_m: np.ndarray
+
+
+def flight(kind: str, model: ImuModel, seed: int, seconds: float = 15.0) -> Flight:
+    """A smooth random motion, a line at constant velocity or a stand, seen with errors of 6 mm and 1 mrad."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, 0.02)
+    hz, phase = rng.uniform(0.1, 0.5, (6, 3)), rng.uniform(0.0, 2.0 * np.pi, (6, 3))
+    waves = np.sin(2.0 * np.pi * hz[:, None] * t[None, :, None] + phase[:, None])
+    moves = kind == "free"
+    T_w_c = np.tile(np.eye(4), (len(t), 1, 1))
+    T_w_c[:, :3, :3] = Rotation.from_rotvec(moves * 0.35 * waves[3:].sum(axis=0)).as_matrix() @ T_IMU_CAM[:3, :3]
+    T_w_c[:, :3, 3] = moves * 0.5 * waves[:3].sum(axis=0) + (kind == "line") * np.outer(t, [0.8, 0.3, 0.1])
+    readings = simulate_imu(rng, t, T_w_c, model)
+    T = T_w_c[25:-35:5].copy()
+    error = rng.standard_normal((len(T), 6))
+    rho = math.exp(-0.1 / CORRELATED_S)
+    for k in range(1, len(T)):
+        error[k] = rho * error[k - 1] + math.sqrt(1.0 - rho**2) * error[k]
+    R_m_w = Rotation.random(rng=rng).as_matrix()
+    T[:, :3, :3] = R_m_w @ T[:, :3, :3] @ Rotation.from_rotvec(1e-3 * error[:, :3]).as_matrix()
+    T[:, :3, 3] = (T[:, :3, 3] + 0.006 * error[:, 3:]) @ R_m_w.T / SCALE
+    return Flight(t[25:-35:5], T, readings, R_m_w[:, 2])
+
+
+def fitted(seen: Flight, model: ImuModel) -> Imu:
+    imu = Imu(model)
+    imu.add([seen.readings])
+    imu.fit(seen.stamps_s, seen.T_m_c)
+    return imu
+
+
+@pytest.mark.parametrize("kind", [ADIS16448, MPU6050], ids=["ADIS16448", "MPU-6050"])
+def test_scale_and_vertical_with_honest_sigmas(kind: ImuModel) -> None:
+    model = mounted(kind, T_IMU_CAM)
+    errors, sigmas, tilts = [], [], []
+    for seed in range(12):
+        seen = flight("free", model, seed)
+        found = fitted(seen, model)
+        assert found.scale is not None and found.up is not None
+        assert found.warnings() == []
+        errors.append(found.scale.log_scale - math.log(SCALE))
+        sigmas.append(found.scale.sigma)
+        tilts.append(math.acos(min(1.0, float(found.up[0] @ seen.up_m))) / (math.sqrt(2.0) * found.up[1]))
+    z = np.array(errors) / sigmas
+    assert np.median(np.abs(errors)) < 0.005
+    assert np.max(np.abs(errors)) < 0.015
+    assert np.sqrt(np.mean(z**2)) < 1.4
+    assert np.sqrt(np.mean(np.square(tilts))) < 2.0
+
+
+def test_sigma_of_a_short_flight_is_honest() -> None:
+    model = mounted(ADIS16448, T_IMU_CAM)
+    z = []
+    for seed in range(24):
+        alignment = fitted(flight("free", model, seed, seconds=4.5), model).alignment
+        assert alignment is not None
+        z.append((alignment.log_scale - math.log(SCALE)) / alignment.sigma_log_scale)
+    assert np.mean(np.abs(z) < 2.0) > 0.8
+    assert np.sqrt(np.mean(np.square(z))) > 0.4
+
+
+@pytest.mark.parametrize("kind", [ADIS16448, MPU6050], ids=["ADIS16448", "MPU-6050"])
+@pytest.mark.parametrize("motion", ["static", "line"])
+def test_without_acceleration_there_is_no_scale(motion: str, kind: ImuModel) -> None:
+    model = mounted(kind, T_IMU_CAM)
+    for seed in range(4):
+        found = fitted(flight(motion, model, seed), model)
+        assert found.scale is None
+        assert len(found.warnings()) == 1
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 0.03, -0.2])
+def test_mount_and_clock_are_found(offset_s: float) -> None:
+    for seed in range(3):
+        seen = flight("free", mounted(ADIS16448, T_IMU_CAM, offset_s), seed)
+        found = fitted(seen, replace(ADIS16448, **UNKNOWN)).alignment
+        assert found is not None
+        assert found.offset_s == pytest.approx(offset_s, abs=1e-3)
+        off = Rotation.from_matrix(T_IMU_CAM[:3, :3].T @ found.R_i_c).magnitude()
+        assert math.degrees(off) < 0.3
+        assert math.exp(found.log_scale) == pytest.approx(SCALE, rel=0.02)
+
+
+def test_without_rotation_no_mount() -> None:
+    found = fitted(flight("line", mounted(ADIS16448, T_IMU_CAM), 0), replace(ADIS16448, **UNKNOWN))
+    assert found.alignment is None
+    assert len(found.warnings()) == 1
+
+
+@pytest.mark.parametrize("fault", ["axes", "degrees", "other flight"])
+def test_readings_that_contradict_the_images_are_not_used(fault: str) -> None:
+    model = mounted(ADIS16448, T_IMU_CAM)
+    seen = flight("free", model, 0)
+    there = seen.readings
+    rate = {
+        "axes": there.angular_rate_rad_s[:, [1, 0, 2]],
+        "degrees": np.rad2deg(there.angular_rate_rad_s),
+        "other flight": flight("free", model, 1).readings.angular_rate_rad_s,
+    }[fault]
+    seen.readings = ImuReadings(there.stamps_s, rate, there.acceleration_m_s2)
+    found = fitted(seen, model)
+    assert found.scale is None and found.up is None
+    assert len(found.warnings()) == 1
+
+
+def test_rotation_between_frames() -> None:
+    model = mounted(ADIS16448, T_IMU_CAM)
+    seen = flight("free", model, 0)
+    R_c_c = fitted(seen, model).turned(seen.stamps_s[-3], seen.stamps_s[-1])
+    assert R_c_c is not None
+    visual = seen.T_m_c[-1, :3, :3].T @ seen.T_m_c[-3, :3, :3]
+    assert Rotation.from_matrix(R_c_c.T @ visual).magnitude() < 0.005
+
+
+def test_the_reading_of_a_frame_may_come_with_the_next() -> None:
+    model = mounted(ADIS16448, T_IMU_CAM)
+    seen = flight("free", model, 0)
+    seen.readings = seen.readings.between(-np.inf, seen.stamps_s[-1] - 0.004)
+    assert fitted(seen, model).scale is not None
