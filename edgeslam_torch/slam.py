@@ -124,7 +124,6 @@ class EdgeSlam:
         self._repeats = RepeatedImages()
         self._calibration_warning: str | None = None
         self._losses: dict[str, float] = {}
-        self._felt: list[ImuReadings] = []
         self.up: Up | None = None
         """Vertical in the output frame after `finish`: z, unless the axes are those of a loaded map. None if unknown; z
         is then the first camera's up axis."""
@@ -253,7 +252,6 @@ class EdgeSlam:
             system.shows_nothing_new = self._repeats.repeats(seen.grey, frame.stamp_s)
         with system.timed("fusion"):
             telemetry, felt = separated(readings)
-            self._felt += felt
             system.fusion.add_imu(felt)
             system.fusion.add_telemetry(telemetry)
             system.has_telemetry = system.has_telemetry or len(telemetry) > 0
@@ -319,9 +317,7 @@ class EdgeSlam:
         self._calibration_warning = calibration_warning(self.camera, self._shown_keyframes(), self.map.anchors.p_w)
 
     def _find_up(self) -> None:
-        """Determine the vertical: by an IMU's alignment; from the drone's attitude, with which the world is aligned
-        already; else from accelerometer and edges, after which the world is rotated, unless its axes are those of a
-        loaded map."""
+        """Find the vertical by IMU, attitude, or accelerometer and edges; level the world, but no loaded map's axes."""
         system, felt_up = self._system, self._system.fusion.imu.up
         if felt_up is not None and not self._earlier.pieces:
             system.published = system.published.levelled(felt_up[0], np.zeros(3))
@@ -334,7 +330,7 @@ class EdgeSlam:
         by_edges = up_by_edges(shown, self.edges.hosts, self.camera)
         whole = self.support().whole()
         stamps_s, T_w_c = self.log.poses()
-        felt = up_by_gravity(ImuReadings.joined(self._felt), self.imu, stamps_s[whole], T_w_c[whole])
+        felt = up_by_gravity(ImuReadings.joined(system.fusion.imu.forces), self.imu, stamps_s[whole], T_w_c[whole])
         up = best_known(felt, by_edges)
         if up is None:
             return

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.estimation.inertial.alignment import Alignment, align
 from edgeslam_torch.estimation.inertial.preintegration import HELD_S, preintegrate
 from edgeslam_torch.estimation.scale.log_scale import LogScale
+from edgeslam_torch.geometry.gyroscope_check import checked_against_rotation
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.types import FloatArray
 
@@ -46,8 +47,10 @@ class Imu:
         self.model = model
         self.alignment: Alignment | None = None
         """Newest alignment with the present submap, whether or not its scale is observable."""
-        self.contradicted = False
-        """Whether readings and images do not move together."""
+        self.fault = ""
+        """Why readings and images do not move together; empty if they do."""
+        self.forces: list[ImuReadings] = []
+        """Readings of an accelerometer without a gyroscope, which only tell the vertical."""
         self._parts: list[ImuReadings] = []
         self._mount: tuple[FloatArray, float] | None = None
         if model.T_imu_cam is not None and model.time_offset_s is not None:
@@ -58,7 +61,8 @@ class Imu:
         return sum(map(len, self._parts))
 
     def add(self, parts: Sequence[ImuReadings]) -> None:
-        """Readings in temporal order; those of an accelerometer alone are not used."""
+        """Readings in temporal order."""
+        self.forces += [part for part in parts if not part.has_gyroscope]
         self._parts += [part for part in parts if len(part) and part.has_gyroscope]
 
     def begin_submap(self, stamp_s: float) -> None:
@@ -102,8 +106,11 @@ class Imu:
         if found is None:  # the second time linearised at the first's biases and offset
             rough = self._aligned(stamps_s[k], T_m_c[k], readings, None)
             found = None if rough is None else self._aligned(stamps_s[k], T_m_c[k], readings, rough)
-        self.contradicted = found is not None and found.sigma_pose[0] > _CONTRADICTED_RAD
-        self.alignment = None if self.contradicted else found
+        self.fault = ""
+        if found is not None and found.sigma_pose[0] > _CONTRADICTED_RAD:
+            check = checked_against_rotation(readings, self.model, stamps_s, T_m_c[:, :3, :3])
+            found, self.fault = None, check.fault or "the IMU contradicts the images"
+        self.alignment = found
 
     def _aligned(
         self, stamps_s: FloatArray, T_m_c: FloatArray, readings: ImuReadings, before: Alignment | None
@@ -161,11 +168,8 @@ class Imu:
         """What could not be determined, and why."""
         if not self._parts:
             return []
-        if self.contradicted:
-            return [
-                "the IMU contradicts the images' rotations and is not used: is it of this recording, in rad/s, with "
-                "the axes of its T_imu_cam?"
-            ]
+        if self.fault:
+            return [f"IMU not used: {self.fault}"]
         if self._mount is None:
             return [
                 "the camera's rotation on the IMU is not observable yet: turn about two axes, or give T_imu_cam and "
