@@ -101,7 +101,7 @@ class System:
     # -- motion ------------------------------------------------------------------------------------------------
 
     def predict(self, stamp_s: float, lost: bool) -> FloatArray:
-        """Predicted ``T_c_w``: constant velocity over short gaps, telemetry over others.
+        """Predicted ``T_c_w``: constant velocity over short gaps, telemetry over others; a gyroscope's rotation.
 
         Telemetry goes through the Kalman filter once scale and delay are known.
         """
@@ -110,7 +110,12 @@ class System:
             estimate = self.fusion.predict(stamp_s)
             if estimate is not None:
                 return se3.inverse(estimate.T_w_c)
-        return self.motion.predict(stamp_s)
+        T_c_w, R_c_c = self.motion.predict(stamp_s), self.fusion.imu.turned(self.motion.stamp_s, stamp_s)
+        if R_c_c is not None:
+            centre = -T_c_w[:3, :3].T @ T_c_w[:3, 3]
+            T_c_w[:3, :3] = R_c_c @ self.motion.T_c_w[:3, :3]
+            T_c_w[:3, 3] = -T_c_w[:3, :3] @ centre
+        return T_c_w
 
     def pose_prior(self, stamp_s: float, T_predicted: FloatArray) -> TrackingPrior | None:
         """The predicted pose with the uncertainty due to accelerations; None without a scale.

@@ -13,7 +13,7 @@ TOLD = se3.exp(np.array([0.3, -0.1, 0.2, 0.1, 0.2, -0.3]))
 """``T_w_c`` predicted by the fusion."""
 
 
-def system(**fusion):
+def system(R_c_c=None, **fusion):
     motion = MotionModel(np.eye(4))
     motion.stamp_s = 0.0
     motion.move(0.1, se3.exp(np.array([0.02, 0.0, 0.0, 0.0, 0.01, 0.0])))
@@ -21,7 +21,11 @@ def system(**fusion):
     return SimpleNamespace(
         has_telemetry=True,
         motion=motion,
-        fusion=SimpleNamespace(predict=lambda stamp_s: SimpleNamespace(T_w_c=TOLD), **fusion),
+        fusion=SimpleNamespace(
+            predict=lambda stamp_s: SimpleNamespace(T_w_c=TOLD),
+            imu=SimpleNamespace(turned=lambda from_s, to_s: R_c_c),
+            **fusion,
+        ),
         stage_ms={},
     )
 
@@ -40,6 +44,15 @@ def test_constant_velocity_otherwise(has_telemetry, filtering, stamp_s):
     keyframes = system(filtering=filtering)
     keyframes.has_telemetry = has_telemetry
     np.testing.assert_array_equal(System.predict(keyframes, stamp_s, False), keyframes.motion.predict(stamp_s))
+
+
+def test_a_gyroscope_predicts_the_rotation():
+    turned = se3.exp(np.array([0.0, 0.0, 0.0, 0.1, -0.2, 0.05]))[:3, :3]
+    keyframes = system(turned, filtering=False)
+    T_c_w = System.predict(keyframes, 0.2, False)
+    np.testing.assert_allclose(T_c_w[:3, :3], turned @ keyframes.motion.T_c_w[:3, :3], atol=1e-12)
+    even = se3.inverse(keyframes.motion.predict(0.2))
+    np.testing.assert_allclose(se3.inverse(T_c_w)[:3, 3], even[:3, 3], atol=1e-12)
 
 
 def test_a_correction_of_the_map_is_passed_to_the_fusion():
