@@ -29,6 +29,10 @@ _GUESS_CONTRADICTION, _GUESS_OFF = 1.0, 0.05
 reach 0.16 at best: a guess is replaced as soon as measured metres are probably better, unless the change is
 negligible."""
 
+_IMPROVED = 0.5
+"""Share of the published scale's sigma at which an IMU's estimate replaces it, if it is off by more than the new sigma:
+an IMU's first estimate is good to a tenth, and to a hundredth ten seconds later."""
+
 MEASURED = frozenset({"telemetry", "height", "imu"})
 """Sources that measure metres; the depth network has set the initial guess already."""
 
@@ -44,6 +48,8 @@ class OutputFrame:
     """Number of revisions so far."""
     guessed: bool = True
     """Whether the scale is still the initial guess, without validated metres."""
+    sigma: float = math.inf
+    """Relative standard deviation of the scale at its last revision."""
     upright: bool = False
     """Whether the axes are final: z up by the drone's attitude, or those of an earlier flight."""
 
@@ -118,13 +124,19 @@ class OutputFrame:
         """
         if not self.is_wrong_by(estimate):
             return self
-        return replace(self._rescaled(estimate.value, centre_map), guessed=False)
+        sigma = estimate.sigma / estimate.value
+        return replace(self._rescaled(estimate.value, centre_map), guessed=False, sigma=sigma)
+
+    def _improves(self, estimate: ScaleEstimate) -> bool:
+        """Whether an IMU's estimate is much better than the published scale."""
+        sigma = estimate.sigma / estimate.value
+        return "imu" in estimate.source and sigma < _IMPROVED * self.sigma and self._off(estimate) > sigma
 
     def is_wrong_by(self, estimate: ScaleEstimate) -> bool:
         """Whether an estimate [metres per map unit] is measured, accurate, and contradicts the published scale."""
         measured = not MEASURED.isdisjoint(estimate.source.split("+"))
         sure = GUESS_SURE if self.guessed else SURE
-        wrong = self.contradicts(estimate) or self._worse_guess(estimate)
+        wrong = self.contradicts(estimate) or self._worse_guess(estimate) or self._improves(estimate)
         return measured and estimate.sigma < sure * estimate.value and wrong
 
 

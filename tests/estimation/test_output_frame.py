@@ -137,3 +137,12 @@ def test_nose_down_drone_looks_down_more():
     """Positive pitch about body y (left) lowers the nose."""
     T = first_pose(np.array([0.0, 0.1, 0.0]), camera_on_body(TILT, 0.0))
     np.testing.assert_allclose(T[2, 2], -np.sin(TILT + 0.1), atol=1e-12)
+
+
+@pytest.mark.parametrize(("source", "revisions"), [("imu", 2), ("telemetry", 1)])
+def test_a_much_better_estimate_of_an_imu_replaces_its_first(source: str, revisions: int) -> None:
+    centre = np.array([1.0, 2.0, 3.0])
+    first = OutputFrame().revised(ScaleEstimate(2.0, 0.14, source), centre)
+    same = first.revised(ScaleEstimate(1.92, 0.09, source), centre)
+    assert same == first
+    assert first.revised(ScaleEstimate(1.92, 0.05, source), centre).revision == revisions
