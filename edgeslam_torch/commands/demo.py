@@ -40,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--battery", type=float, default=87.0, metavar="PERCENT", help="charge at take-off (default: 87)"
     )
     parser.add_argument("--no-telemetry", action="store_true", help="fly without telemetry: no metres from the drone")
+    parser.add_argument("--imu", action="store_true", help="carry an IMU (200 Hz, MPU-6050 grade)")
     parser.add_argument(
         "--depth",
         metavar="FILE|NAME|none",
@@ -147,5 +148,5 @@ def _settings(args: argparse.Namespace) -> "DemoSettings":
     if not 160 <= args.width <= 1920 or args.width % 4:
         raise ConfigError(f"--width must be 160 to 1920 and a multiple of 4, got {args.width}")
     size = {"width": args.width, "height": args.width * 3 // 4}
-    settings = DemoSettings(args.world, seconds, rate_hz, args.seed, args.images, **size)
+    settings = DemoSettings(args.world, seconds, rate_hz, args.seed, args.images, imu=args.imu, **size)
     return replace(settings, telemetry=None if args.no_telemetry else faults)

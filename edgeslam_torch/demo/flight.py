@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.files.imu_files import MODEL, READINGS
 from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ, SECONDS, record_flight, simulated_camera
 from edgeslam_torch.synthetic.flights.degrade import CLEAN, CameraFaults
 from edgeslam_torch.synthetic.flights.flight import Flight
+from edgeslam_torch.synthetic.flights.imu import MPU6050
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults
 from edgeslam_torch.synthetic.house.world import World
 
@@ -46,6 +48,8 @@ class DemoSettings:
     """A name in `CAMERAS`."""
     telemetry: TelemetryFaults | None = TelemetryFaults()
     """None flies without telemetry."""
+    imu: bool = False
+    """Whether the drone carries an IMU (MPU-6050 grade, 200 Hz)."""
     width: int = 640
     height: int = 480
 
@@ -99,6 +103,7 @@ def record(folder: Path, settings: DemoSettings, on_frame: Callable[[int], None]
         settings.telemetry,
         CAMERAS[settings.images],
         seed=settings.seed,
+        imu=MPU6050 if settings.imu else None,
         threads=min(4, os.cpu_count() or 1),
         on_frame=on_frame,
     )
@@ -126,6 +131,7 @@ def _clear(recording: Path) -> None:
             for file in sorted((recording / folder).glob("*.*")):
                 if file.suffix in (".jpg", ".png"):
                     file.unlink()
-        (recording / "telemetry.csv").unlink(missing_ok=True)
+        for name in ("telemetry.csv", READINGS, MODEL):
+            (recording / name).unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{recording}: an older demo there cannot be replaced ({error.strerror or error})") from error

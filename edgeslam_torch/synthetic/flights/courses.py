@@ -9,8 +9,10 @@ from typing import Protocol
 import numpy as np
 
 from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.imu import ImuModel
 from edgeslam_torch.synthetic.flights.degrade import CameraFaults
 from edgeslam_torch.synthetic.flights.flight import Flight, FlightPlan, climb, fly, fly_after_hover, fly_around, turn
+from edgeslam_torch.synthetic.flights.imu import mounted, simulate_imu
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 from edgeslam_torch.synthetic.flights.writer import write_flight
 from edgeslam_torch.synthetic.house.rooms import BLOCK_M, BUILDING_M, blank_corridor, block, building, corridor, room
@@ -115,10 +117,11 @@ def record_flight(
     faults: CameraFaults,
     *,
     seed: int,
+    imu: ImuModel | None = None,
     threads: int = 1,
     on_frame: Callable[[int], None] | None = None,
 ) -> None:
-    """Write a flight's images, truth, exact depth and telemetry into ``folder``.
+    """Write a flight's images, truth, exact depth, telemetry and IMU readings into ``folder``.
 
     Args:
         folder: Made when missing.
@@ -128,7 +131,8 @@ def record_flight(
         camera: Intrinsics.
         telemetry: How bad the telemetry is; None for none.
         faults: What the camera does to the images.
-        seed: Of the image noise.
+        seed: Of the image and IMU noise.
+        imu: Grade of an IMU in the axes of the drone's body; None for none.
         threads: Frames drawn at a time.
         on_frame: Called with the number of frames done.
 
@@ -139,12 +143,17 @@ def record_flight(
     if telemetry is not None:
         floor = world.floor_below(flight.T_w_b[:, :3, 3])
         log = simulate(rng, flight.stamps_s, flight.T_w_c, flight.T_b_c, faults=telemetry, floor_m=floor)
+    felt = None
+    if imu is not None:
+        model = mounted(imu, flight.T_b_c)
+        felt = simulate_imu(np.random.default_rng([seed, 59]), flight.stamps_s, flight.T_w_c, model), model
     write_flight(
         folder,
         world,
         flight,
         camera,
         telemetry=log,
+        imu=felt,
         faults=faults,
         seed=seed,
         depth_every=DEPTH_EVERY,

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch import demo
+from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.synthetic.flights.courses import (
     COURSES,
     LOW_LIGHT,
@@ -133,3 +134,13 @@ def test_room_and_corridor_are_the_demos(tmp_path):
         assert (tmp_path / "course" / file).read_bytes() == (tmp_path / "demo" / file).read_bytes()
     assert {name: COURSES[name] for name in demo.WORLDS} == demo.WORLDS
     assert (demo.DemoSettings().seconds, settings.rate_hz) == (SECONDS, RATE_HZ)
+
+
+def test_a_flight_with_an_imu_is_read_with_its_mount(tmp_path):
+    settings = demo.DemoSettings("corridor", seconds=1.0, seed=4, width=160, height=120, imu=True)
+    flight = demo.record(tmp_path / "demo", settings).flight
+    source = open_source(tmp_path / "demo")
+    assert source.imu.T_imu_cam == pytest.approx(flight.T_b_c) and source.imu.time_offset_s == 0.0
+    assert source.imu.rate_hz == pytest.approx(200) and len(source.imu_readings) == 190
+    force_w = source.imu_readings.acceleration_m_s2.mean(axis=0) @ flight.T_w_b[:, :3, :3].mean(axis=0).T
+    assert force_w == pytest.approx([0.0, 0.0, 9.81], abs=1.0)
