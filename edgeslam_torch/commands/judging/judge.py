@@ -8,7 +8,7 @@ from edgeslam_torch.commands.judging._common import recordings, say, writing
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.atomic import write_text
 
-CELLS = ("base", "variants", "flights", "telemetry", "all")
+CELLS = ("base", "variants", "flights", "telemetry", "imu", "all")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
