@@ -10,11 +10,12 @@ import importlib
 
 _HOMES = {
     "recipes.finetune": "Data FromRuns finetune",
-    "hook_names": "named_hooks",
+    "hooks": "Drawn Hooks named_hooks",
+    "state": "TrainConfig TrainState",
     "folder": "Existing OutFolder out_folder",
     "result": "TrainingResult",
     "processes.distributed": "process_group rank world",
-    "recipe": "DivergedError Drawn Hooks NonFiniteLossError TrainConfig TrainState Validation train",
+    "recipe": "DivergedError NonFiniteLossError Validation train",
     "self_supervised": "SelfSupervised SelfSupervisedWeights",
     "signals": "Signal Slot Source Supervised SupervisedWeights",
     "validate": "DepthScores image_tensor predict_metres score",

@@ -12,8 +12,9 @@ import numpy as np
 from edgeslam_torch.extras import install_command
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.terminal.progress import Progress
+from edgeslam_torch.train.hooks import Hooks
 from edgeslam_torch.train.processes.distributed import rank
-from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState
+from edgeslam_torch.train.state import TrainConfig, TrainState
 from edgeslam_torch.train.validate import predict_metres
 from edgeslam_torch.train.views.augment import View
 

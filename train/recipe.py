@@ -1,42 +1,38 @@
-"""The training recipe; `Hooks` are its extension points.
+"""The loop that every recipe runs; hooks (`train.hooks`) are its extension points.
 
 A step is a function of (seed, step): no random state persists, so a killed run resumes exactly from its last
 checkpoint, and a batch split over processes is the same batch.
 """
 
 import copy
-import io
 import json
 import logging
 import math
-import pickle
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from edgeslam_torch.errors import ConfigError, EdgeSlamError, WeightsError
-from edgeslam_torch.files.atomic import write_atomically, write_text
+from edgeslam_torch.errors import ConfigError, EdgeSlamError
+from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.models.checkpoint import save_checkpoint
-from edgeslam_torch.models.device import DEVICES
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.models.trainable import DepthModule, Prediction
-from edgeslam_torch.train.processes.device import Arithmetic, arithmetic
+from edgeslam_torch.models.trainable import DepthModule
+from edgeslam_torch.train.hooks import Drawn, Hooks
+from edgeslam_torch.train.processes.device import arithmetic
 from edgeslam_torch.train.processes.distributed import add_up, by_first, everyones, rank, world
 from edgeslam_torch.train.processes.loading import drawn
 from edgeslam_torch.train.processes.shared_norm import share_norms
 from edgeslam_torch.train.signals import Signal, Slot
+from edgeslam_torch.train.state import TrainConfig, TrainState, resume, save_state, saved_step
 
 logger = logging.getLogger(__name__)
 
 LAST, BEST, FINAL, CURVE = "last.pt", "best.safetensors", "final.safetensors", "curve.jsonl"
 """Files of `train`: its whole state, the best validated and the last averaged weights, the validations."""
-MAX_BATCH = 1024
-"""Images: tens of gigabytes."""
-MAX_WORKERS = 256
 NO_ROOM_M = (0.02, 90.0)
 """Plausible median depth; a network mostly outside of it has diverged."""
 
@@ -47,160 +43,6 @@ class DivergedError(EdgeSlamError):
 
 class NonFiniteLossError(DivergedError):
     """A loss was NaN or infinite; the message names the batch."""
-
-
-@dataclass(frozen=True, slots=True)
-class TrainConfig:
-    """Settings of the recipe."""
-
-    steps: int = 2000
-    batch: int = 8
-    """Images per step over all processes."""
-    seed: int = 0
-    lr: float = 1e-3
-    """Peak learning rate of the decoder."""
-    encoder_lr: float = 1e-4
-    """Learning rate of the encoder; small because its weights, with batch norm folded in, are about 0.05, and Adam
-    moves each by this per step."""
-    frozen_stages: int = 4
-    """conv0 ... conv(n-1) are not trained; 14 freezes the encoder."""
-    freeze_norm: bool = False
-    """Keep all batch-norm statistics (right for fine-tuning on little data); the encoder's are always
-    kept. Those that learn see the images of all processes at once."""
-    weight_decay: float = 1e-2
-    warmup_steps: int = 100
-    lr_end: float = 0.01
-    """Final share of the peak rate; 1 keeps it constant."""
-    clip_norm: float = 1.0
-    ema_decay: float = 0.998
-    """Decay of the averaged weights that are validated and saved."""
-    validate_every: int = 250
-    checkpoint_every: int = 250
-    patience: int = 0
-    """Validations without improvement before stopping; 0 never stops early."""
-    amp: bool | None = False
-    """Autocast: bfloat16, on GPUs without it float16 with scaled gradients; None: on CUDA alone."""
-    channels_last: bool = True
-    device: str = "cpu"
-    """``auto``, ``cpu``, ``cuda`` or ``mps``."""
-    workers: int = 0
-    """Processes that draw batches ahead; 0 draws between the steps."""
-    accumulate: int = 1
-    """Parts that a process learns its images of a step in, one after another, which takes less memory. The step is the
-    same, unless norms learn: each part has its own statistics."""
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch", "validate_every", "checkpoint_every", "accumulate"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.batch > MAX_BATCH:
-            raise ValueError(f"batch must be at most {MAX_BATCH}, got {self.batch}")
-        for name in ("lr", "encoder_lr"):
-            # Adam moves every weight by about this per step, and weights are about 0.05.
-            if not 0.0 < getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} must be above 0 and at most 1, got {getattr(self, name)}")
-        for name in ("seed", "patience", "warmup_steps", "frozen_stages", "workers"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
-        if self.workers > MAX_WORKERS:
-            raise ValueError(f"workers must be at most {MAX_WORKERS}, got {self.workers}")
-        if self.accumulate > self.batch:
-            raise ValueError(f"accumulate must be at most the batch, {self.batch}, got {self.accumulate}")
-        if self.device not in DEVICES:
-            raise ValueError(f"device must be one of {', '.join(DEVICES)}, got {self.device}")
-
-
-@dataclass
-class TrainState:
-    """Everything that changes during a run; a checkpoint holds what a resume needs."""
-
-    network: DepthModule
-    averaged: DepthModule
-    optimiser: torch.optim.Optimizer
-    step: int = 0
-    best: float = math.inf
-    best_step: int = 0
-    """After which the best weights were validated; 0: none was better than the weights training began with."""
-    stale: int = 0
-    history: list[dict[str, float]] = field(default_factory=list)
-    shown: Tensor | None = None
-    """Some images of the last batch ``(B, 3, H, W)``."""
-    whole: bool = True
-    """False while a step changes the weights."""
-    statistics: dict[str, Tensor] = field(default_factory=dict)
-    """Buffers of norms that learn, as they were before the step that is under way: its forward pass changes them."""
-    stop: str = ""
-    """Why training is to end after this step; a hook may write it. Not empty in one process, it ends all."""
-    arithmetic: Arithmetic = field(default_factory=lambda: arithmetic("cpu", amp=False))
-    scaler: torch.amp.GradScaler = field(default_factory=lambda: torch.amp.GradScaler("cpu", enabled=False))
-    """Of float16 alone."""
-
-
-@dataclass
-class Drawn:
-    """What one signal drew for this process, between the network and the gradient."""
-
-    signal: str
-    """Its name: ``supervised`` (labels), ``teacher`` (measured depth) or ``self`` (pairs)."""
-    batch: dict[str, Tensor]
-    """What the signal drew, with ``image`` the network's normalised input ``(B, 3, H, W)``; of ``self``, first images
-    and then their partners ``(2 B, 3, H, W)``. To be read."""
-    predicted: Prediction
-    """The network's output for ``image``, with its gradient. To be read."""
-    losses: dict[str, Tensor]
-    """By name, one value an image ``(B,)``, weighted: change them, add others, remove some. Their sum is minimised,
-    averaged over the images of all processes."""
-
-
-class Hooks:
-    """What happens around the recipe's steps; every method does nothing here. Write a subclass with those you need.
-
-    In order: ``on_start``; for every step ``on_losses`` (once a signal) and ``on_step``; at times ``on_validation``;
-    ``on_end``; ``close``. Under ``torchrun`` each process calls its own hooks, for its own images: what only reports
-    does so where `edgeslam_torch.train.rank` gives 0. A step depends on the seed, its number and the weights alone, so
-    that a resume repeats it; a hook that draws random numbers or remembers steps has to see to that itself. An
-    exception ends training, with the last whole step saved.
-    """
-
-    def on_start(self, state: TrainState, config: TrainConfig) -> None:
-        """Before the first step of this process (also after a resume, at ``state.step``).
-
-        May change the peak learning rates, ``state.optimiser.param_groups[i]["peak"]``. All else is to be read.
-        """
-
-    def on_losses(self, state: TrainState, drawn: Drawn) -> None:
-        """Before each gradient, once for every signal; may change ``drawn.losses``.
-
-        Called in every process, and must do the same in each. ``finetune.json`` keeps the names of hooks that
-        have this method: a training is not resumed with other ones.
-        """
-
-    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
-        """After each optimiser step, with the mean losses ``signal/name`` of this process's images.
-
-        ``state.shown`` has some of the images ``(B, 3, H, W)``, as the network sees them. May write ``state.stop``: the
-        averaged weights are validated, and training ends.
-        """
-
-    def on_validation(self, state: TrainState, metrics: dict[str, float]) -> None:
-        """After each validation of the averaged weights, ``state.averaged``; may write ``state.stop``.
-
-        Args:
-            state: With ``best``, ``best_step`` and ``stale`` brought up to date.
-            metrics: Of `edgeslam_torch.train.DepthScores`, and ``score``, which decides what is best; the same in every
-                process.
-        """
-
-    def on_end(self, state: TrainState, reason: str) -> None:
-        """Once, when the run ends normally; the files are written."""
-
-    def close(self) -> None:
-        """Called last in any case: release files and the terminal."""
-
-
-def changes_losses(hook: Hooks) -> bool:
-    """Whether a hook takes part in what is minimised."""
-    return type(hook).on_losses is not Hooks.on_losses
 
 
 Validation = Callable[[DepthModule], dict[str, float]]
@@ -288,40 +130,26 @@ def _loop(
     hooks: Sequence[Hooks],
 ) -> str:
     """Run all steps; returns the reason for stopping."""
-    parts = _Parts(signals, config, rank(), world())
-    with drawn(parts, state.step, config.steps, config.workers) as batches:
-        return _steps(state, signals, config, metadata, out, validate, hooks, batches)
-
-
-def _steps(
-    state: TrainState,
-    signals: Sequence[Signal],
-    config: TrainConfig,
-    metadata: Metadata,
-    out: Path,
-    validate: Validation | None,
-    hooks: Sequence[Hooks],
-    batches: Iterator[list["_Part"]],
-) -> str:
-    while True:
-        _agree_to_stop(state)
-        if validate is not None and _validation_is_due(state, config):
-            metrics = by_first(lambda: validate(state.averaged))
-            _note(state, metrics, metadata, out)
-            for hook in hooks:
-                hook.on_validation(state, metrics)
+    with drawn(_Parts(signals, config, rank(), world()), state.step, config.steps, config.workers) as batches:
+        while True:
             _agree_to_stop(state)
-        if config.patience and state.stale >= config.patience:
-            return f"no improvement in {config.patience} validations"
-        if state.step >= config.steps:
-            return "all steps done"
-        if state.stop:
-            return state.stop
-        losses = _step(state, signals, config, hooks, next(batches))
-        for hook in hooks:
-            hook.on_step(state, losses)
-        if state.step % config.checkpoint_every == 0 or state.step == config.steps:
-            by_first(lambda: _save_good(state, out))
+            if validate is not None and _validation_is_due(state, config):
+                metrics = by_first(lambda: validate(state.averaged))
+                _note(state, metrics, metadata, out)
+                for hook in hooks:
+                    hook.on_validation(state, metrics)
+                _agree_to_stop(state)
+            if config.patience and state.stale >= config.patience:
+                return f"no improvement in {config.patience} validations"
+            if state.step >= config.steps:
+                return "all steps done"
+            if state.stop:
+                return state.stop
+            losses = _step(state, signals, config, hooks, next(batches))
+            for hook in hooks:
+                hook.on_step(state, losses)
+            if state.step % config.checkpoint_every == 0 or state.step == config.steps:
+                by_first(lambda: _save_good(state, out))
 
 
 def _validation_is_due(state: TrainState, config: TrainConfig) -> bool:
@@ -553,70 +381,3 @@ def _note(state: TrainState, metrics: dict[str, float], metadata: Metadata, out:
     state.history.append({"step": float(state.step), **metrics})
     if rank() == 0:
         write_text(out / CURVE, "".join(json.dumps(row) + "\n" for row in state.history))
-
-
-def save_state(state: TrainState, path: Path) -> None:
-    """Write all of a run's state, atomically: a kill during writing leaves the previous file.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    content = {
-        "network": state.network.state_dict(),
-        "averaged": state.averaged.state_dict(),
-        "optimiser": state.optimiser.state_dict(),
-        "scaler": state.scaler.state_dict(),
-        "step": state.step,
-        "best": state.best,
-        "best_step": state.best_step,
-        "stale": state.stale,
-        "history": state.history,
-    }
-    # Serialised in memory first: torch masks disk errors.
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    write_atomically(path, lambda file: file.write(buffer.getbuffer()))
-
-
-def resume(state: TrainState, path: Path) -> bool:
-    """Load a run's state if there is one; learning rates stay those that ``state`` was made with.
-
-    Raises:
-        WeightsError: If the file is damaged or of another network.
-    """
-    if not path.is_file():
-        return False
-    peaks = [group["peak"] for group in state.optimiser.param_groups]
-    with _damage_is_named(path):
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        state.network.load_state_dict(content["network"])
-        state.averaged.load_state_dict(content["averaged"])
-        state.optimiser.load_state_dict(content["optimiser"])
-        if state.scaler.is_enabled() and content.get("scaler"):
-            state.scaler.load_state_dict(content["scaler"])
-        state.step, state.best, state.stale = content["step"], content["best"], content["stale"]
-        state.best_step, state.history = content["best_step"], content["history"]
-    for group, peak in zip(state.optimiser.param_groups, peaks, strict=True):
-        group["peak"] = peak
-    return True
-
-
-def saved_step(path: Path) -> int:
-    """Steps behind a saved state, 0 when there is none.
-
-    Raises:
-        WeightsError: If the file is damaged.
-    """
-    if not path.is_file():
-        return 0
-    with _damage_is_named(path):
-        return int(torch.load(path, map_location="cpu", weights_only=True, mmap=True)["step"])
-
-
-@contextmanager
-def _damage_is_named(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (RuntimeError, EOFError, ValueError, KeyError, TypeError, pickle.UnpicklingError) as error:
-        why = " ".join(str(error).split())[:160]
-        raise WeightsError(f"{path}: damaged or of another network, training cannot go on from it ({why})") from error

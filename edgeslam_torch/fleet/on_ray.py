@@ -32,17 +32,17 @@ class OnRay:
     retries: int = 1
     """For a process or a Ray worker that was killed."""
 
-    def __call__(self, tasks: Iterable[T], prepare: Callable[[T], Path]) -> Generator[tuple[T, Ended]]:
+    def __call__(self, cases: Iterable[T], prepare: Callable[[T], Path]) -> Generator[tuple[T, Ended]]:
         """See `edgeslam_torch.eval.experiment.runner.Runner`."""
         ray = _connected(self.address)
         try:  # an interrupted batch disconnects: Ray ends its workers, and flights end with them (ray.cancel crashed)
-            yield from self._run(ray, tasks, prepare)
+            yield from self._run(ray, cases, prepare)
         finally:
             ray.shutdown()
 
-    def _run(self, ray: Any, tasks: Iterable[T], prepare: Callable[[T], Path]) -> Generator[tuple[T, Ended]]:
+    def _run(self, ray: Any, cases: Iterable[T], prepare: Callable[[T], Path]) -> Generator[tuple[T, Ended]]:
         remote = ray.remote(num_cpus=1, max_retries=self.retries)(_attempt)
-        waiting = deque(tasks)
+        waiting = deque(cases)
         running: dict[Any, T] = {}
         while waiting or running:
             most = _QUEUED_PER_CPU * max(1, int(ray.cluster_resources().get("CPU", 1)))

@@ -35,7 +35,7 @@ class Row:
 
 
 ROWS = {
-    name: Row(**{key: tuple(value) if isinstance(value, list) else value for key, value in row.items()})
+    name: Row(row["title"], tuple(row.get("set", ())), row.get("against", DEFAULT), row.get("first", ""))
     for name, row in tomllib.loads(Path(__file__).with_name("ablation.toml").read_text(encoding="utf-8")).items()
 }
 """The table of `edgeslam ablation` by name, top to bottom."""

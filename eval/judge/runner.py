@@ -61,7 +61,11 @@ def judge(
     flights.mkdir(parents=True, exist_ok=True)
 
     def task(cell: Cell) -> Task:
-        case = {"commit": commit, "overrides": list(settings.overrides), "max_frames": settings.max_frames}
+        case: dict[str, Any] = {
+            "commit": commit,
+            "overrides": list(settings.overrides),
+            "max_frames": settings.max_frames,
+        }
         case |= {"cell": cell.to_dict()}
         return Task(
             out / "cells", cell.slug, "edgeslam_torch.eval.judge.run_cell:run_cell", case, {"flights": str(flights)}

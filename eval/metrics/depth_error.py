@@ -82,9 +82,9 @@ def score_depth(
     scale = float(np.median(truth)) / middle if median_scaled else 1.0
     d = np.maximum(d * scale, MIN_DEPTH_M)
     ratio = np.maximum(d / truth, truth / d)
-    deltas = (float(np.mean(ratio < 1.25**k)) for k in (1, 2, 3))
+    one, two, three = (float(np.mean(ratio < 1.25**k)) for k in (1, 2, 3))
     abs_rel, rmse = float(np.mean(np.abs(d - truth) / truth)), float(np.sqrt(np.mean((d - truth) ** 2)))
-    return DepthScore(len(d), abs_rel, rmse, float(np.sqrt(np.mean(np.log(d / truth) ** 2))), *deltas, scale)
+    return DepthScore(len(d), abs_rel, rmse, float(np.sqrt(np.mean(np.log(d / truth) ** 2))), one, two, three, scale)
 
 
 def report_depth(prediction: FloatArray, truth: FloatArray, image: NDArray[np.uint8] | None = None) -> DepthReport:

@@ -122,8 +122,8 @@ def build_surface(dataset: EvalDataset) -> SurfaceTruth:
     edge_index = set(index[:: max(1, len(index) // _EDGE_FRAMES)].tolist())
     camera = measured.taken_by(colour)
     # Pixels are taken, not averaged: sub-pixel phase 0 of every stride, hence the plain division below.
-    strided = (value / _STRIDE for value in (camera.fx, camera.fy, camera.cx, camera.cy))
-    small = Camera(camera.width // _STRIDE, camera.height // _STRIDE, *strided, source=camera.source)
+    fx, fy, cx, cy = (value / _STRIDE for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    small = Camera(camera.width // _STRIDE, camera.height // _STRIDE, fx, fy, cx, cy, source=camera.source)
     clouds, edges, maps = [], [], []
     for i in index:
         depth = measured.read(int(i), colour)

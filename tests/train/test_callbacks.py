@@ -14,8 +14,10 @@ from edgeslam_torch.models.checkpoint import build_network
 from edgeslam_torch.models.fastdepth import Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.callbacks import ProgressBar, TensorBoard
-from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState, train
+from edgeslam_torch.train.hooks import Hooks
+from edgeslam_torch.train.recipe import train
 from edgeslam_torch.train.signals import Source, Supervised
+from edgeslam_torch.train.state import TrainConfig, TrainState
 from edgeslam_torch.train.views.augment import View
 
 METADATA = Metadata(input_height=32, input_width=64, focal_px=50.0)

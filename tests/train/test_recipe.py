@@ -21,20 +21,13 @@ from edgeslam_torch.models.checkpoint import build_network, load_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Prediction, Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import recipe
+from edgeslam_torch.train import state as state_file
+from edgeslam_torch.train.hooks import Drawn, Hooks
 from edgeslam_torch.train.processes.device import Arithmetic
 from edgeslam_torch.train.processes.loading import WorkerError
-from edgeslam_torch.train.recipe import (
-    DivergedError,
-    Drawn,
-    Hooks,
-    NonFiniteLossError,
-    TrainConfig,
-    TrainState,
-    learning_rate_factor,
-    saved_step,
-    train,
-)
+from edgeslam_torch.train.recipe import DivergedError, NonFiniteLossError, learning_rate_factor, train
 from edgeslam_torch.train.signals import Slot, Source, Supervised, SupervisedWeights
+from edgeslam_torch.train.state import TrainConfig, TrainState, saved_step
 from edgeslam_torch.train.validate import image_tensor
 from edgeslam_torch.train.views.augment import AugmentConfig, View
 
@@ -163,7 +156,7 @@ def test_full_disk_keeps_the_checkpoint_before(tmp_path: Path, monkeypatch: pyte
     class FullAt3(Hooks):
         def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
             if state.step == 3:
-                monkeypatch.setattr(recipe, "write_atomically", full)
+                monkeypatch.setattr(state_file, "write_atomically", full)
 
     with pytest.raises(OSError, match="No space left"):
         run(tmp_path, hooks=[FullAt3()])

@@ -23,8 +23,10 @@ from edgeslam_torch.models.imagenet import load_imagenet_encoder
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
-from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState, train
+from edgeslam_torch.train.hooks import Hooks
+from edgeslam_torch.train.recipe import train
 from edgeslam_torch.train.signals import Source, Supervised
+from edgeslam_torch.train.state import TrainConfig, TrainState
 from edgeslam_torch.train.validate import score
 from edgeslam_torch.train.views.augment import AugmentConfig, View
 from edgeslam_torch.train.views.datasets import load_depth_folder

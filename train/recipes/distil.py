@@ -29,11 +29,12 @@ from edgeslam_torch.models.layout import Variant
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.folder import OutFolder
+from edgeslam_torch.train.hooks import Hooks
 from edgeslam_torch.train.inputs import posed_set
 from edgeslam_torch.train.processes.distributed import rank, world
-from edgeslam_torch.train.recipe import Hooks, TrainConfig
 from edgeslam_torch.train.recipes.finetune import Data, finetune
 from edgeslam_torch.train.result import TrainingResult
+from edgeslam_torch.train.state import TrainConfig
 from edgeslam_torch.train.teachers.cache import TeacherCache
 from edgeslam_torch.train.teachers.teach import teach
 from edgeslam_torch.train.views.datasets import DepthFolder

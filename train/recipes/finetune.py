@@ -22,12 +22,14 @@ from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
 from edgeslam_torch.train.callbacks import ProgressBar, curves
 from edgeslam_torch.train.folder import TEACHER, TENSORBOARD, WEIGHTS, OutFolder
+from edgeslam_torch.train.hooks import Hooks, changes_losses
 from edgeslam_torch.train.inputs import HOOKS, Inputs, labelled_set, posed_set, weights_name
 from edgeslam_torch.train.processes.distributed import by_first, rank
-from edgeslam_torch.train.recipe import BEST, FINAL, Hooks, TrainConfig, TrainState, changes_losses, train
+from edgeslam_torch.train.recipe import BEST, FINAL, train
 from edgeslam_torch.train.result import TrainingResult
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Signal, Source, Supervised
+from edgeslam_torch.train.state import TrainConfig, TrainState
 from edgeslam_torch.train.teachers.cache import TeacherCache
 from edgeslam_torch.train.teachers.teach import Taught, teach
 from edgeslam_torch.train.validate import DepthScores, can_be_scored, metres_by, predict_metres, score

@@ -19,10 +19,11 @@ from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
 from edgeslam_torch.models.device import DEVICES
 from edgeslam_torch.models.trainable import DepthModule
-from edgeslam_torch.train.recipe import FINAL, TrainConfig, train
+from edgeslam_torch.train.recipe import FINAL, train
 from edgeslam_torch.train.recipes.default_weights import Progress, Scores
 from edgeslam_torch.train.recipes.rendered_views import render_files
 from edgeslam_torch.train.signals import Source, Supervised, SupervisedWeights
+from edgeslam_torch.train.state import TrainConfig
 from edgeslam_torch.train.views.augment import AugmentConfig
 from edgeslam_torch.train.views.datasets import load_depth_folder
 from edgeslam_torch.train.views.rendered import stored_views

@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from edgeslam_torch.models.record import Metadata
     from edgeslam_torch.models.trainable import DepthModule
     from edgeslam_torch.train.folder import OutFolder
-    from edgeslam_torch.train.recipe import Hooks, TrainConfig
+    from edgeslam_torch.train.hooks import Hooks
     from edgeslam_torch.train.recipes.finetune import FromRuns
     from edgeslam_torch.train.result import TrainingResult
+    from edgeslam_torch.train.state import TrainConfig
     from edgeslam_torch.train.teachers.cache import TeacherCache
     from edgeslam_torch.train.views.datasets import DepthFolder
     from edgeslam_torch.train.views.posed import PosedSequence
@@ -131,7 +132,7 @@ def train_config(args: argparse.Namespace, lr: float, frozen_stages: int, freeze
     Raises:
         ConfigError: With the option that makes no sense.
     """
-    from edgeslam_torch.train.recipe import TrainConfig
+    from edgeslam_torch.train.state import TrainConfig
 
     every = max(args.steps // 8, 1)
     try:

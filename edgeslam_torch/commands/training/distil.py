@@ -25,8 +25,9 @@ if TYPE_CHECKING:
     from edgeslam_torch.models.fastdepth import FastDepth
     from edgeslam_torch.models.record import Metadata
     from edgeslam_torch.train.folder import OutFolder
-    from edgeslam_torch.train.recipe import Hooks, TrainConfig
+    from edgeslam_torch.train.hooks import Hooks
     from edgeslam_torch.train.result import TrainingResult
+    from edgeslam_torch.train.state import TrainConfig
 
 HELP = "distil a larger depth network into a drone-sized one, on recordings without labels"
 
@@ -58,7 +59,7 @@ def main(args: argparse.Namespace) -> int:
     items = items_of(args, ignore_depth=True)
 
     from edgeslam_torch.frontend.depth_network import open_depth, weights_path
-    from edgeslam_torch.train.hook_names import named_hooks
+    from edgeslam_torch.train.hooks import named_hooks
 
     teacher = open_depth(weights_path(args.teacher), threads=args.threads)
     student, metadata, is_new = _student(args.depth)

@@ -25,9 +25,10 @@ if TYPE_CHECKING:
     from edgeslam_torch.models.fastdepth import FastDepth
     from edgeslam_torch.models.record import Metadata
     from edgeslam_torch.train.folder import OutFolder
-    from edgeslam_torch.train.recipe import Hooks, TrainConfig
+    from edgeslam_torch.train.hooks import Hooks
     from edgeslam_torch.train.recipes.finetune import Data
     from edgeslam_torch.train.result import TrainingResult
+    from edgeslam_torch.train.state import TrainConfig
 
 logger = logging.getLogger(__name__)
 
@@ -63,7 +64,7 @@ def main(args: argparse.Namespace) -> int:
     items = items_of(args, args.ignore_depth)
 
     from edgeslam_torch.models.checkpoint import load_checkpoint
-    from edgeslam_torch.train.hook_names import named_hooks
+    from edgeslam_torch.train.hooks import named_hooks
 
     config = train_config(args, args.lr, frozen_stages=14 if args.freeze_encoder else 4, freeze_norm=True)
     hooks = named_hooks(args.hook)

@@ -10,7 +10,7 @@ from edgeslam_torch.flying.tasks import WayHome
 from edgeslam_torch.navigation.corridor.follow import FollowCorridor
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.navigation.tasks import Explore, GoTo, Task
-from edgeslam_torch.synthetic.sites.site import Site
+from edgeslam_torch.synthetic.sites.site import Site, TrueExit
 from edgeslam_torch.types import FloatArray
 
 REACHED_M = 0.35
@@ -100,7 +100,7 @@ def right_exits(found: Sequence[Exit], site: Site) -> int:
         0
     """
 
-    def same(exit_: Exit, true: Exit) -> bool:
+    def same(exit_: Exit, true: TrueExit) -> bool:
         near = float(np.linalg.norm(exit_.centre_w[:2] - true.centre_w[:2])) < _SAME_EXIT_M
         return near and abs(float(exit_.normal_w @ true.normal_w)) > _SAME_EXIT_COS
 

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,8 @@ def check(case: Case) -> None:
     Raises:
         EvaluationError: If one does not.
     """
-    known = {"world": SITES, "fault": FAULTS, "behaviour": BEHAVIOURS, "perception": PERCEPTIONS}
+    known: dict[str, Collection[str]] = {"world": SITES, "fault": FAULTS, "behaviour": BEHAVIOURS}
+    known["perception"] = PERCEPTIONS
     for what, names in known.items():
         if getattr(case, what) not in names:
             raise EvaluationError(f"unknown {what} {getattr(case, what)!r}; there are {', '.join(names)}")

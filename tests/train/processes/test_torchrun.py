@@ -15,7 +15,7 @@ import torch
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import Widths
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.recipe import saved_step
+from edgeslam_torch.train.state import saved_step
 
 pytestmark = pytest.mark.slow
 

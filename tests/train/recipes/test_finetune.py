@@ -20,8 +20,9 @@ from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, sav
 from edgeslam_torch.models.fastdepth import Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import recipe
+from edgeslam_torch.train import state as state_file
 from edgeslam_torch.train.callbacks import ProgressBar
-from edgeslam_torch.train.recipe import TrainState, saved_step
+from edgeslam_torch.train.state import TrainState, saved_step
 from edgeslam_torch.writers.own_folder import FolderLock
 
 METADATA = Metadata(
@@ -248,7 +249,7 @@ def test_full_disk_is_one_line_and_goes_on_later(
     finetune: Finetune, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     saved = []
-    real = recipe.write_atomically
+    real = state_file.write_atomically
 
     def full(path: Path, write: Callable) -> None:
         saved.append(path)
@@ -257,7 +258,7 @@ def test_full_disk_is_one_line_and_goes_on_later(
         real(path, write)
 
     with monkeypatch.context() as patch:
-        patch.setattr(recipe, "write_atomically", full)
+        patch.setattr(state_file, "write_atomically", full)
         refused(finetune("kitchen"), "last.pt: No space left on device")
     assert saved_step(tmp_path / "out" / "last.pt") == 3
     code, stdout, _ = finetune("kitchen")
