@@ -12,7 +12,7 @@ import time
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +110,7 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
     record: dict[str, Any] = {
         "format": FORMAT,
         "version": __version__,
-        "commit": code_state(),
+        "commit": _commit(),
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "machine": machine(),
         "seeds": list(settings.seeds),
@@ -184,10 +184,16 @@ def _task(
     arguments += ["--max-frames", str(settings.max_frames)] if settings.max_frames is not None else []
     for override in (*settings.overrides, *more):
         arguments += ["--set", override]
-    case = {"commit": code_state(), "recording": str(folder), "arguments": arguments, "first": first}
+    case = {"commit": _commit(), "recording": str(folder), "arguments": arguments, "first": first}
     return Task(
         out / "cases", name, "edgeslam_torch.eval.benchmark.benchmark:run_sequence", case, {"out": str(out / name)}
     )
+
+
+@lru_cache(maxsize=1)
+def _commit() -> str:
+    """State of the code when the benchmark began."""
+    return code_state()
 
 
 def run_sequence(case: dict[str, Any], folder: Path) -> dict[str, Any]:
