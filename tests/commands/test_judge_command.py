@@ -8,8 +8,14 @@ import pytest
 from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch import cli
+from edgeslam_torch.commands.judging import judge
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
+from edgeslam_torch.eval.judge import cells
 from edgeslam_torch.geometry.camera_file import save_camera
+
+
+def test_every_set_of_cells_is_offered():
+    assert judge.CELLS == cells.SETS
 
 
 @pytest.fixture
