@@ -5,14 +5,15 @@ Forward shifts of templates with the Gauss-Newton step of the inverse compositio
 warped to the other camera, assuming a surface parallel to the image that it comes from.
 """
 
+import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeslam_torch.compiled import compiled
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.types import FloatArray, IntArray
+from edgeslam_torch.types import FloatArray
 
 HALF_PX = 4
 """Half the side of a patch: 9 pixels, the size of a corner with its surroundings."""
@@ -22,10 +23,7 @@ UNLIKE = 0.5
 _DONE_PX = 0.01
 _LONGEST_PX = 1.0
 """Maximum length of a step, the range of validity of the gradients."""
-_OFFSETS = np.arange(-HALF_PX - 1, HALF_PX + 2, dtype=np.float32)
-_X, _Y = (a.ravel() for a in np.meshgrid(_OFFSETS, _OFFSETS))
-_INNER = np.maximum(np.abs(_X), np.abs(_Y)) <= HALF_PX
-SIDE_PX = len(_OFFSETS)
+SIDE_PX = 2 * HALF_PX + 3
 """Side of a template: a patch and the pixels around it, for its gradients."""
 
 
@@ -78,17 +76,33 @@ def patch_warps(uv: FloatArray, depth: FloatArray, T_to_from: FloatArray, camera
     return inverse
 
 
+@compiled
 def templates(image: NDArray[np.uint8], uv: FloatArray, warps: FloatArray) -> FloatArray:
-    """Grey values ``(N, S, S)`` around points of an image, warped to another camera.
+    """Grey values ``(N, S, S)`` float32 around points of an image, warped to another camera; the border is replicated.
 
     Args:
         image: Grey ``(H, W)``.
         uv: Pixels ``(N, 2)``.
-        warps: ``(N, 2, 2)`` from `patch_warps`.
+        warps: ``(N, 2, 2)`` from `patch_warps`; where one is not finite, so is its template.
     """
-    x = uv[:, :1] + warps[:, 0, :1] * _X + warps[:, 0, 1:] * _Y
-    y = uv[:, 1:] + warps[:, 1, :1] * _X + warps[:, 1, 1:] * _Y
-    return _looked_up(image, x, y).reshape(len(uv), SIDE_PX, SIDE_PX)
+    height, width = image.shape
+    patches = np.full((len(uv), SIDE_PX, SIDE_PX), np.nan, np.float32)
+    for n in range(len(uv)):
+        A = warps[n]
+        if not np.isfinite(A[0, 0] + A[0, 1] + A[1, 0] + A[1, 1]):
+            continue
+        for i in range(SIDE_PX):
+            for j in range(SIDE_PX):
+                x, y = j - HALF_PX - 1.0, i - HALF_PX - 1.0
+                u = min(max(uv[n, 0] + A[0, 0] * x + A[0, 1] * y, 0.0), width - 1.0)
+                v = min(max(uv[n, 1] + A[1, 0] * x + A[1, 1] * y, 0.0), height - 1.0)
+                left, top = int(u), int(v)
+                right, below = min(left + 1, width - 1), min(top + 1, height - 1)
+                a, b = u - left, v - top
+                above = image[top, left] + a * (float(image[top, right]) - image[top, left])
+                under = image[below, left] + a * (float(image[below, right]) - image[below, left])
+                patches[n, i, j] = above + b * (under - above)
+    return patches
 
 
 def find(image: NDArray[np.uint8], uv: FloatArray, patches: FloatArray) -> Found:
@@ -99,46 +113,65 @@ def find(image: NDArray[np.uint8], uv: FloatArray, patches: FloatArray) -> Found
         uv: Initial pixels ``(N, 2)``, accurate to a pixel or two.
         patches: From `templates`.
     """
-    t = _level(patches[:, 1:-1, 1:-1])
-    gx, gy = (
-        _level(0.5 * (patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2])),
-        _level(0.5 * (patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1])),
-    )
-    a, b, c = (gx * gx).sum(1), (gx * gy).sum(1), (gy * gy).sum(1)
-    det = a * c - b * b
-    least = 0.5 * (a + c - np.sqrt(np.maximum((a + c) ** 2 - 4.0 * det, 0.0)))
-    there = np.asarray(uv, dtype=np.float64).copy()
-    rest = np.full(len(there), np.inf)
-    going: IntArray = np.flatnonzero(np.isfinite(t).all(1) & (det > 1e-6 * (a + c) ** 2))
-    for _ in range(STEPS):
-        if len(going) == 0:
-            break
-        seen = _looked_up(image, there[going, :1] + _X[_INNER], there[going, 1:] + _Y[_INNER])
-        r = _level(seen) - t[going]
-        rest[going] = (r * r).mean(1)
-        u, v = (gx[going] * r).sum(1), (gy[going] * r).sum(1)
-        step = np.stack([b[going] * v - c[going] * u, b[going] * u - a[going] * v], axis=1) / det[going, None]
-        length = np.linalg.norm(step, axis=1)
-        there[going] += step * np.minimum(1.0, _LONGEST_PX / np.maximum(length, 1e-9))[:, None]
-        going = going[length > _DONE_PX]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        sigma = np.sqrt(rest / least)
-    same = rest < UNLIKE * (t * t).mean(1)
-    return Found(there, np.where(same & (least > 0.0), sigma, np.inf))
+    there = np.array(uv, dtype=np.float64)
+    return Found(there, _aligned(image, there, patches))
 
 
-def _level(patches: FloatArray) -> FloatArray:
-    """Patches as rows ``(N, P)`` without their mean."""
-    rows = patches.reshape(len(patches), np.count_nonzero(_INNER))
-    level: FloatArray = rows - rows.mean(1, keepdims=True)
-    return level
-
-
-def _looked_up(image: NDArray[np.uint8], x: FloatArray, y: FloatArray) -> FloatArray:
-    """Interpolated grey values ``(N, P)`` float32; the border is replicated."""
-    if len(x) == 0:  # OpenCV rejects empty arrays
-        return np.zeros(x.shape, np.float32)
-    grey = cv2.remap(
-        image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    return grey.astype(np.float32)
+@compiled
+def _aligned(image: NDArray[np.uint8], there: FloatArray, patches: FloatArray) -> FloatArray:
+    """Moves the pixels ``there`` to their patches; returns the sigmas ``(N,)``."""
+    side = 2 * HALF_PX + 1
+    area = side * side
+    height, width = image.shape
+    sigma = np.full(len(there), np.inf)
+    t, gx, gy, seen = np.zeros(area), np.zeros(area), np.zeros(area), np.zeros(area)
+    for n in range(len(there)):
+        P = patches[n]
+        k = 0
+        for i in range(1, side + 1):
+            for j in range(1, side + 1):
+                t[k] = P[i, j]
+                gx[k] = 0.5 * (P[i, j + 1] - P[i, j - 1])
+                gy[k] = 0.5 * (P[i + 1, j] - P[i - 1, j])
+                k += 1
+        for row in (t, gx, gy):
+            row -= row.mean()
+        a, b, c = (gx * gx).sum(), (gx * gy).sum(), (gy * gy).sum()
+        det = a * c - b * b
+        if not det > 1e-6 * (a + c) ** 2:  # also where the template is not finite
+            continue
+        rest = np.inf
+        for _ in range(STEPS):
+            # The whole patch has the same fraction of a pixel.
+            u, v = math.floor(there[n, 0]), math.floor(there[n, 1])
+            right, below = there[n, 0] - u, there[n, 1] - v
+            k = 0
+            for i in range(side):
+                y = int(v) + i - HALF_PX
+                top, bottom = min(max(y, 0), height - 1), min(max(y + 1, 0), height - 1)
+                for j in range(side):
+                    x = int(u) + j - HALF_PX
+                    here, beside = min(max(x, 0), width - 1), min(max(x + 1, 0), width - 1)
+                    one, two = float(image[top, here]), float(image[bottom, here])
+                    one += right * (image[top, beside] - one)
+                    two += right * (image[bottom, beside] - two)
+                    seen[k] = one + below * (two - one)
+                    k += 1
+            mean = seen.mean()
+            rest, p, q = 0.0, 0.0, 0.0
+            for k in range(area):
+                r = seen[k] - mean - t[k]
+                rest += r * r
+                p += gx[k] * r
+                q += gy[k] * r
+            du, dv = (b * q - c * p) / det, (b * p - a * q) / det
+            length = math.hypot(du, dv)
+            shorter = min(1.0, _LONGEST_PX / max(length, 1e-9))
+            there[n, 0] += du * shorter
+            there[n, 1] += dv * shorter
+            if length <= _DONE_PX:
+                break
+        least = 0.5 * (a + c - math.sqrt(max((a + c) ** 2 - 4.0 * det, 0.0)))
+        if rest < UNLIKE * (t * t).sum() and least > 0.0:
+            sigma[n] = math.sqrt(rest / area / least)
+    return sigma

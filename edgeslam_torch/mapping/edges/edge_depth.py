@@ -5,22 +5,21 @@ semi-dense mapping (Engel et al., ICCV 2013; Mur-Artal and Tardos, RSS 2015), by
 the edge with what the other keyframes show at each hypothesis: first coarsely, in smoothed images to the nearest
 pixel, then around the only good hypothesis with interpolation. An edge that runs along the epipolar line cannot be
 measured and is left out.
-
-Edges are the last axis of every array, so that everything runs over contiguous memory.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeslam_torch.compiled import compiled
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.types import FloatArray, IntArray
+from edgeslam_torch.types import FloatArray
 
 STEP_PX = 1.75
-"""Mean spacing of the coarse search's hypotheses in the images: half the width of the cost valley of an edge whose
+"""Spacing of the coarse search's hypotheses, mean over the targets: half the width of the cost valley of an edge whose
 profile is sampled 1.5 px to either side."""
 HYPOTHESES = (8, 24)
 """Minimum and maximum number of hypotheses of the coarse search."""
@@ -42,8 +41,8 @@ line."""
 MIN_SHARE = 0.5
 """Minimum sum of these sines over the targets."""
 
-_CHUNK = 4096
-"""Edges searched at a time, so that temporaries fit the processor's cache."""
+COARSE_PX, FINE_PX = (-4.0, -1.5, 1.5, 4.0), (-4.0, -2.0, 0.0, 2.0, 4.0)
+"""Where the profile across an edge is sampled, along its normal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,43 +62,6 @@ class EdgeDepth:
     """``(E,)`` [1/map unit], NaN where not measured."""
     sigma: FloatArray
     """``(E,)`` its standard deviation."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Sampling:
-    """Sampling of grey values across an edge."""
-
-    offsets_px: FloatArray
-    """``(P, 1, 1)`` along the edge's normal."""
-    interpolation: int
-
-
-_COARSE = _Sampling(np.array([-4.0, -1.5, 1.5, 4.0], np.float32)[:, None, None], cv2.INTER_NEAREST)
-_FINE = _Sampling(np.array([-4.0, -2.0, 0.0, 2.0, 4.0], np.float32)[:, None, None], cv2.INTER_LINEAR)
-
-
-@dataclass(frozen=True, slots=True)
-class _Lines:
-    """Epipolar lines of the host's edges in a target: inverse depth ``rho`` projects to ``ray + rho step``."""
-
-    grey: NDArray[np.uint8]
-    ray: FloatArray
-    """``(3, E)`` homogeneous pixels of edges at infinity."""
-    step: FloatArray
-    """``(3,)``"""
-    normal: FloatArray
-    """``(2, E)`` unit normals of the edges."""
-
-    def of(self, edges: IntArray) -> "_Lines":
-        """The lines of selected edges."""
-        return _Lines(self.grey, self.ray.take(edges, axis=1), self.step, self.normal.take(edges, axis=1))
-
-    def pixels(self, rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Pixels and depths ``(..., E)`` at inverse depths; the depths in units of the edge's own in the host."""
-        x, y, z = (rho * along + start for along, start in zip(self.step, self.ray, strict=True))
-        x /= z
-        y /= z
-        return x, y, z
 
 
 def measure_edge_depth(
@@ -124,22 +86,24 @@ def measure_edge_depth(
         camera: Intrinsics.
         most: Number of hypotheses of the coarse search.
     """
-    inverse_depth, sigma = np.full(len(uv), np.nan), np.full(len(uv), np.nan)
     if len(uv) == 0 or not targets:
-        return EdgeDepth(inverse_depth, sigma)
-    pixel, across = uv.T.astype(np.float32), normal.T.astype(np.float32)
-    reach = np.exp(2.5 * prior_sigma_log)
-    low, high = ((1.0 / (prior_depth * reach)).astype(np.float32), (reach / prior_depth).astype(np.float32))
-    with np.errstate(divide="ignore", invalid="ignore"):  # points beside or behind a target get infinite cost
-        lines = [_epipolar_lines(host, target, pixel, across, camera) for target in targets]
-        edges, rho, step = _coarse_search(_smooth(host.grey), pixel, across, lines, low, high, camera, most)
-        for part in _parts(len(edges)):
-            some = edges[part]
-            profile = _profile(host.grey, pixel.take(some, axis=1), across.take(some, axis=1), _FINE)
-            near = [line.of(some) for line in lines]
-            inverse_depth[some] = _fine_search(profile, near, rho[part], np.float32(FINE_STEP) * step[part], camera)
-        measured = np.flatnonzero(np.isfinite(inverse_depth))
-        sigma[measured] = _sigma([line.of(measured) for line in lines], inverse_depth[measured])
+        return EdgeDepth(np.full(len(uv), np.nan), np.full(len(uv), np.nan))
+    K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    turned = np.stack([target.T_c_w[:3, :3] @ host.T_c_w[:3, :3].T for target in targets])
+    moved = np.stack([target.T_c_w[:3, 3] - R @ host.T_c_w[:3, 3] for target, R in zip(targets, turned, strict=True)])
+    reach = np.exp(2.5 * np.asarray(prior_sigma_log, dtype=np.float64))
+    inverse_depth, sigma = _search(
+        np.stack([_smooth(view.grey) for view in (host, *targets)]),
+        np.stack([view.grey for view in (host, *targets)]),
+        np.asarray(uv, dtype=np.float64),
+        np.asarray(normal, dtype=np.float64),
+        1.0 / (prior_depth * reach),
+        reach / prior_depth,
+        K @ turned @ np.linalg.inv(K),
+        moved @ K.T,
+        turned[:, :2, :2].copy(),
+        most,
+    )
     return EdgeDepth(inverse_depth, sigma)
 
 
@@ -148,157 +112,204 @@ def _smooth(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return cv2.blur(grey, (3, 3)).astype(np.uint8, copy=False)
 
 
-def _epipolar_lines(host: StereoView, target: StereoView, uv: FloatArray, normal: FloatArray, camera: Camera) -> _Lines:
-    K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-    R = target.T_c_w[:3, :3] @ host.T_c_w[:3, :3].T
-    t = target.T_c_w[:3, 3] - R @ host.T_c_w[:3, 3]
-    H = (K @ R @ np.linalg.inv(K)).astype(np.float32)
-    turned = R[:2, :2].astype(np.float32) @ normal
-    turned /= np.maximum(np.hypot(*turned), np.float32(1e-6))
-    return _Lines(target.grey, H[:, :2] @ uv + H[:, 2:], (K @ t).astype(np.float32), turned)
-
-
-def _parts(count: int) -> Iterator[slice]:
-    return (slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK))
-
-
-def _coarse_search(
+@compiled
+def _search(
+    smooth: NDArray[np.uint8],
     grey: NDArray[np.uint8],
     uv: FloatArray,
     normal: FloatArray,
-    lines: list[_Lines],
     low: FloatArray,
     high: FloatArray,
-    camera: Camera,
+    H: FloatArray,
+    along: FloatArray,
+    R: FloatArray,
     most: int,
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Edges ``(N,)`` with a unique minimum, the inverse depth of the minimum and the step of the search."""
-    ends = [_measurable(line, low, high, camera) for line in lines]
-    share, length = np.stack([s for s, _ in ends]), np.stack([n for _, n in ends])
-    searched = np.flatnonzero(share.sum(axis=0) >= MIN_SHARE)
-    if len(searched) == 0:
-        return searched, low[:0], low[:0]
-    count = int(np.clip(length[share > 0].mean() / STEP_PX + 1.5, HYPOTHESES[0], most))
-    step = (high - low) / np.float32(count - 1)
-    smooth = [_Lines(_smooth(line.grey), line.ray, line.step, line.normal) for line in lines]
-    found = []
-    for part in _parts(len(searched)):
-        some = searched[part]
-        profile = _profile(grey, uv.take(some, axis=1), normal.take(some, axis=1), _COARSE)
-        near = [line.of(some) for line in smooth]
-        cost = _cost(profile, near, share.take(some, axis=1), low[some], step[some], count, _COARSE)
-        best = cost.argmin(axis=0)
-        lowest = cost.min(axis=0)
-        # Unique: no other valley nearly as deep.
-        cost[np.abs(np.arange(count)[:, None] - best) <= VALLEY] = np.inf
-        good = (best > 0) & (best < count - 1) & (lowest < MAX_COST) & (cost.min(axis=0) > UNIQUE * lowest + 1.0)
-        found.append((some[good], low[some[good]] + best[good].astype(np.float32) * step[some[good]]))
-    edges, rho = (np.concatenate(side) for side in zip(*found, strict=True))
-    return edges, rho, step[edges]
+) -> tuple[FloatArray, FloatArray]:
+    """Inverse depths of edges and their sigmas ``(E,)``, NaN where not measured.
+
+    Args:
+        smooth: Smoothed images ``(1 + T, H, W)`` of host and targets.
+        grey: The images themselves.
+        uv: Pixels ``(E, 2)``.
+        normal: Unit normals ``(E, 2)``.
+        low: Minimum inverse depths ``(E,)``.
+        high: Maximum inverse depths.
+        H: Homographies of infinity ``(T, 3, 3)``: inverse depth ``rho`` projects to ``H uv + rho along``.
+        along: ``(T, 3)``
+        R: ``(T, 2, 2)``, turns normals to the targets.
+        most: Maximum number of hypotheses.
+    """
+    targets = len(H)
+    size = smooth.shape[2], smooth.shape[1]
+    inverse_depth, sigma = np.full(len(uv), np.nan), np.full(len(uv), np.nan)
+    ray, across, share = np.zeros((targets, 3)), np.zeros((targets, 2)), np.zeros(targets)
+    coarse, fine = np.zeros(4), np.zeros(5)
+    cost = np.zeros(max(most, HYPOTHESES[0]))
+    for e in range(len(uv)):
+        weight, length, crossing = 0.0, 0.0, 0
+        for t in range(targets):
+            for i in range(3):
+                ray[t, i] = H[t, i, 0] * uv[e, 0] + H[t, i, 1] * uv[e, 1] + H[t, i, 2]
+            for i in range(2):
+                across[t, i] = R[t, i, 0] * normal[e, 0] + R[t, i, 1] * normal[e, 1]
+            across[t] /= max(math.hypot(across[t, 0], across[t, 1]), 1e-6)
+            share[t], pixels = _measurable(ray[t], along[t], across[t], low[e], high[e], size)
+            if share[t] > 0.0:
+                weight += share[t]
+                length += pixels
+                crossing += 1
+        if weight < MIN_SHARE:
+            continue
+        count = min(max(int(length / crossing / STEP_PX + 1.5), HYPOTHESES[0]), most)
+        step = (high[e] - low[e]) / (count - 1)
+        for i in range(4):
+            px = COARSE_PX[i]
+            coarse[i] = _interpolated(smooth[0], uv[e, 0] + px * normal[e, 0], uv[e, 1] + px * normal[e, 1])
+        cost[:count] = 0.0
+        for t in range(targets):
+            if share[t] > 0.0:
+                _add_coarse(
+                    smooth[1 + t], ray[t], along[t], across[t], share[t] / weight, coarse, low[e], step, cost[:count]
+                )
+        best = cost[:count].argmin()
+        other = np.inf
+        for k in range(count):
+            if abs(k - best) > VALLEY:
+                other = min(other, cost[k])
+        if best == 0 or best == count - 1 or cost[best] >= MAX_COST or other <= UNIQUE * cost[best] + 1.0:
+            continue
+        # Descend from the best hypothesis in finer steps, then a parabola through the lowest three.
+        rho = low[e] + best * step
+        step *= FINE_STEP
+        weight = 0.0
+        for t in range(targets):
+            share[t], _ = _measurable(ray[t], along[t], across[t], rho - 3 * step, rho + 3 * step, size)
+            weight += share[t]
+        if weight < MIN_SHARE:
+            continue
+        share /= weight
+        for i in range(5):
+            px = FINE_PX[i]
+            fine[i] = _interpolated(grey[0], uv[e, 0] + px * normal[e, 0], uv[e, 1] + px * normal[e, 1])
+        a = _fine_cost(grey, ray, along, across, share, fine, rho - step)
+        b = _fine_cost(grey, ray, along, across, share, fine, rho)
+        c = _fine_cost(grey, ray, along, across, share, fine, rho + step)
+        if a < c:
+            for _ in range(2):
+                if b <= a:
+                    break
+                rho, b, c = rho - step, a, b
+                a = _fine_cost(grey, ray, along, across, share, fine, rho - step)
+        else:
+            for _ in range(2):
+                if b <= c:
+                    break
+                rho, a, b = rho + step, b, c
+                c = _fine_cost(grey, ray, along, across, share, fine, rho + step)
+        curvature = a - 2.0 * b + c
+        if not (curvature > 1e-3 and b < MAX_COST):
+            continue
+        rho += min(max(0.5 * (a - c) / curvature, -1.0), 1.0) * step
+        # Half a pixel of error across the edge in every target.
+        information = 1e-12
+        for t in range(targets):
+            z = ray[t, 2] + rho * along[t, 2]
+            x, y = (ray[t, 0] + rho * along[t, 0]) / z, (ray[t, 1] + rho * along[t, 1]) / z
+            du, dv = (along[t, 0] - x * along[t, 2]) / z, (along[t, 1] - y * along[t, 2]) / z
+            information += ((du * across[t, 0] + dv * across[t, 1]) / 0.5) ** 2
+        inverse_depth[e], sigma[e] = rho, 1.0 / math.sqrt(information)
+    return inverse_depth, sigma
 
 
-def _fine_search(
-    profile: NDArray[np.uint8], lines: list[_Lines], rho: FloatArray, step: FloatArray, camera: Camera
-) -> FloatArray:
-    """Inverse depth ``(E,)`` of the lowest cost around ``rho``, by a parabola; NaN where no cost is low enough."""
-    count = 7
-    first = rho - count // 2 * step
-    share = np.stack([_measurable(line, first, first + (count - 1) * step, camera)[0] for line in lines])
-    cost = _cost(profile, lines, share, first, step, count, _FINE)
-    k, edge = np.clip(cost.argmin(axis=0), 1, count - 2), np.arange(len(rho))
-    a, b, c = cost[k - 1, edge], cost[k, edge], cost[k + 1, edge]
-    curvature = a - 2.0 * b + c
-    offset = np.clip(0.5 * (a - c) / curvature, -1.0, 1.0)
-    sharp = (curvature > 1e-3) & np.isfinite(offset) & (b < MAX_COST)
-    refined: FloatArray = np.where(sharp, first + (k + offset) * step, np.nan)
-    return refined
+@compiled
+def _add_coarse(
+    smooth: NDArray[np.uint8],
+    ray: FloatArray,
+    along: FloatArray,
+    across: FloatArray,
+    weight: float,
+    expected: FloatArray,
+    low: float,
+    step: float,
+    cost: FloatArray,
+) -> None:
+    """Add a target's weighted differences from the profile ``expected`` at every hypothesis ``(D,)``."""
+    x, y, z = ray[0] + low * along[0], ray[1] + low * along[1], ray[2] + low * along[2]
+    dx, dy, dz = step * along[0], step * along[1], step * along[2]
+    p, q, r, s = COARSE_PX
+    pu, qu, ru, su = 0.5 + p * across[0], 0.5 + q * across[0], 0.5 + r * across[0], 0.5 + s * across[0]
+    pv, qv, rv, sv = 0.5 + p * across[1], 0.5 + q * across[1], 0.5 + r * across[1], 0.5 + s * across[1]
+    for k in range(len(cost)):
+        nearer = 1.0 / z
+        u, v = x * nearer, y * nearer
+        # Unsigned indices, since signed ones may count from the end.
+        a = smooth[np.uint64(int(v + pv)), np.uint64(int(u + pu))] - expected[0]
+        b = smooth[np.uint64(int(v + qv)), np.uint64(int(u + qu))] - expected[1]
+        c = smooth[np.uint64(int(v + rv)), np.uint64(int(u + ru))] - expected[2]
+        d = smooth[np.uint64(int(v + sv)), np.uint64(int(u + su))] - expected[3]
+        common = 0.125 * (a + b + c + d)
+        near = min(abs(a - common), TRUNCATE) + min(abs(b - common), TRUNCATE)
+        cost[k] += 0.25 * weight * (near + min(abs(c - common), TRUNCATE) + min(abs(d - common), TRUNCATE))
+        x, y, z = x + dx, y + dy, z + dz
 
 
-def _measurable(lines: _Lines, low: FloatArray, high: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Sine of the angle between each search segment and its edge ``(E,)``, and the segment's length [px].
+@compiled
+def _measurable(
+    ray: FloatArray, along: FloatArray, across: FloatArray, low: float, high: float, size: tuple[int, int]
+) -> tuple[float, float]:
+    """Sine of the angle between a search segment and its edge, and the segment's length [px].
 
     Zero where it does not cross, or where the segment is not wholly in the target.
     """
-    (x0, y0, z0), (x1, y1, z1) = lines.pixels(low), lines.pixels(high)
-    inside = np.minimum(z0, z1) > 0
-    for p0, p1, size in ((x0, x1, camera.width), (y0, y1, camera.height)):
-        inside &= (np.minimum(p0, p1) > 5) & (np.maximum(p0, p1) < size - 6)
-    du, dv = x1 - x0, y1 - y0
-    length = np.hypot(du, dv)
-    share = np.abs(du * lines.normal[0] + dv * lines.normal[1]) / np.maximum(length, np.float32(1e-6))
-    return np.where(inside & (share > MIN_ACROSS), share, np.float32(0.0)), length
+    z0, z1 = ray[2] + low * along[2], ray[2] + high * along[2]
+    if not (z0 > 0.0 and z1 > 0.0):
+        return 0.0, 0.0
+    x0, x1 = (ray[0] + low * along[0]) / z0, (ray[0] + high * along[0]) / z1
+    y0, y1 = (ray[1] + low * along[1]) / z0, (ray[1] + high * along[1]) / z1
+    if not (min(x0, x1) > 5 and max(x0, x1) < size[0] - 6 and min(y0, y1) > 5 and max(y0, y1) < size[1] - 6):
+        return 0.0, 0.0
+    length = math.hypot(x1 - x0, y1 - y0)
+    share = abs((x1 - x0) * across[0] + (y1 - y0) * across[1]) / max(length, 1e-6)
+    return (share, length) if share > MIN_ACROSS else (0.0, 0.0)
 
 
-def _cost(
-    profile: NDArray[np.uint8],
-    lines: list[_Lines],
-    share: FloatArray,
-    first: FloatArray,
-    step: FloatArray,
-    count: int,
-    sampling: _Sampling,
-) -> FloatArray:
-    """Mean truncated grey difference ``(D, E)`` from profiles ``(P, E)`` over the targets, weighted by ``share``.
-
-    The ``count`` hypotheses of an edge start at the inverse depth ``first`` with spacing ``step``.
-    """
-    total = np.zeros((count, len(first)), np.float32)
-    hypothesis = np.arange(count, dtype=np.float32)[:, None]
-    for line, across in zip(lines, share, strict=True):
-        seen = np.flatnonzero(across)
-        if len(seen) == 0:
-            continue
-        near = line.of(seen)
-        x, y, _ = near.pixels(first[seen] + hypothesis * step[seen])
-        difference = _difference(_across(near.grey, x, y, near.normal, sampling), profile.take(seen, axis=1))
-        # Expanded to all edges with zero weight where unseen: a third of the time of indexed addition.
-        total += across * difference.take(np.cumsum(across > 0) - 1, axis=1)
-    weight = share.sum(axis=0)
-    total[:, weight < MIN_SHARE] = np.inf
-    total /= np.maximum(weight, MIN_SHARE)
-    return total
+@compiled
+def _fine_cost(
+    grey: NDArray[np.uint8],
+    ray: FloatArray,
+    along: FloatArray,
+    across: FloatArray,
+    weight: FloatArray,
+    expected: FloatArray,
+    rho: float,
+) -> float:
+    """Weighted difference of all targets from the profile ``expected`` at an inverse depth."""
+    cost = 0.0
+    for t in range(len(ray)):
+        if weight[t] > 0.0:
+            nearer = 1.0 / (ray[t, 2] + rho * along[t, 2])
+            x, y = (ray[t, 0] + rho * along[t, 0]) * nearer, (ray[t, 1] + rho * along[t, 1]) * nearer
+            a = _interpolated(grey[1 + t], x + FINE_PX[0] * across[t, 0], y + FINE_PX[0] * across[t, 1]) - expected[0]
+            b = _interpolated(grey[1 + t], x + FINE_PX[1] * across[t, 0], y + FINE_PX[1] * across[t, 1]) - expected[1]
+            c = _interpolated(grey[1 + t], x + FINE_PX[2] * across[t, 0], y + FINE_PX[2] * across[t, 1]) - expected[2]
+            d = _interpolated(grey[1 + t], x + FINE_PX[3] * across[t, 0], y + FINE_PX[3] * across[t, 1]) - expected[3]
+            e = _interpolated(grey[1 + t], x + FINE_PX[4] * across[t, 0], y + FINE_PX[4] * across[t, 1]) - expected[4]
+            common = 0.1 * (a + b + c + d + e)
+            near = min(abs(a - common), TRUNCATE) + min(abs(b - common), TRUNCATE) + min(abs(c - common), TRUNCATE)
+            near += min(abs(d - common), TRUNCATE) + min(abs(e - common), TRUNCATE)
+            cost += 0.2 * weight[t] * near
+    return cost
 
 
-def _profile(grey: NDArray[np.uint8], uv: FloatArray, normal: FloatArray, sampling: _Sampling) -> NDArray[np.uint8]:
-    """The host's grey values ``(P, E)`` across edges ``(2, E)``."""
-    exact = replace(sampling, interpolation=cv2.INTER_LINEAR)
-    return _across(grey, uv[:1], uv[1:], normal, exact)[:, 0]
-
-
-def _across(
-    grey: NDArray[np.uint8], x: FloatArray, y: FloatArray, normal: FloatArray, sampling: _Sampling
-) -> NDArray[np.uint8]:
-    """Grey values ``(P, D, E)`` on the profiles through pixels ``(D, E)`` along normals ``(2, E)``."""
-    u, v = (pixel + sampling.offsets_px * along for pixel, along in zip((x, y), normal, strict=True))
-    flat_u, flat_v = (m.reshape(-1, m.shape[-1]) for m in (u, v))
-    seen = cv2.remap(grey, flat_u, flat_v, sampling.interpolation, borderMode=cv2.BORDER_REPLICATE)
-    return seen.reshape(u.shape)
-
-
-def _difference(seen: NDArray[np.uint8], expected: NDArray[np.uint8]) -> FloatArray:
-    """Mean truncated difference ``(D, E)`` of profiles ``(P, D, E)`` from the host's ``(P, E)``, in grey levels.
-
-    Half of a common brightness change is removed: exposure drifts, but brightness also distinguishes edges. 16-bit
-    integers represent the ``2 P``-th part of a grey level exactly and are four times as fast as floats.
-    """
-    parts = 2 * len(seen)
-    difference = seen.astype(np.int16)
-    difference -= expected.astype(np.int16)[:, None]
-    common = difference.sum(axis=0, dtype=np.int16)
-    difference *= np.int16(parts)
-    difference -= common
-    np.abs(difference, out=difference)
-    most = np.full_like(difference[0], parts * TRUNCATE)  # the minimum with one number takes four times as long
-    np.minimum(difference, most, out=difference)
-    return difference.sum(axis=0, dtype=np.int16) * np.float32(1.0 / (parts * len(seen)))
-
-
-def _sigma(lines: list[_Lines], rho: FloatArray) -> FloatArray:
-    """Inverse-depth sigma for half a pixel across the edge, combining all targets."""
-    information = np.full(len(rho), 1e-12)
-    for line in lines:
-        x, y, z = line.pixels(rho)
-        # Derivative of the pixel by inverse depth.
-        du, dv = (line.step[0] - x * line.step[2]) / z, (line.step[1] - y * line.step[2]) / z
-        information += (du * line.normal[0] + dv * line.normal[1]) ** 2 / 0.5**2
-    return 1.0 / np.sqrt(information)
+@compiled
+def _interpolated(grey: NDArray[np.uint8], u: float, v: float) -> float:
+    """Grey value at a pixel; the border is replicated."""
+    height, width = grey.shape
+    u, v = min(max(u, 0.0), width - 1.001), min(max(v, 0.0), height - 1.001)
+    x, y = np.uint64(int(u)), np.uint64(int(v))
+    a, b = u - x, v - y
+    right, below = x + np.uint64(1), y + np.uint64(1)
+    here, under = float(grey[y, x]), float(grey[below, x])
+    here += a * (grey[y, right] - here)
+    under += a * (grey[below, right] - under)
+    return here + b * (under - here)
