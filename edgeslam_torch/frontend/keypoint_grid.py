@@ -1,11 +1,14 @@
 """Radius search over keypoints in a grid of cells, since keypoints are spread evenly and radii are small.
 
-A search takes a third of a k-d tree's time because every query has its own radius: a tree's pair search uses one
-radius for all, which a single anchor of the coarsest pyramid level makes three times too wide.
+Every query has its own radius: a k-d tree's pair search uses one for all, which a single anchor of the coarsest pyramid
+level makes three times too wide.
 """
+
+import math
 
 import numpy as np
 
+from edgeslam_torch.compiled import compiled
 from edgeslam_torch.types import FloatArray, IntArray
 
 CELL_PX = 16.0
@@ -44,36 +47,39 @@ class KeypointGrid:
         """
         if len(query_uv) == 0 or len(self) == 0:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
-        u, v = np.asarray(query_uv, dtype=np.float64).T
-        left, right = self._span(u - self._origin[0], radius_px, self._columns)
-        top, bottom = self._span(v - self._origin[1], radius_px, self._rows)
-        # Keypoints of neighbouring cells in a row are contiguous: one interval per query and row.
-        row_query, row = _unroll(top, bottom - top + 1)
-        first_cell = row * self._columns
-        begin = self._start[first_cell + left[row_query]]
-        run, keypoint = _unroll(begin, self._start[first_cell + right[row_query] + 1] - begin)
-        query = row_query[run]
-        squared, dv = self._u[keypoint], self._v[keypoint]
-        squared -= u[query]
-        dv -= v[query]
-        squared *= squared
-        dv *= dv
-        squared += dv
-        inside = np.flatnonzero(squared <= np.square(radius_px)[query])
-        return query[inside], self._order[keypoint[inside]]
-
-    def _span(self, x: FloatArray, radius_px: FloatArray, cells: int) -> tuple[IntArray, IntArray]:
-        """First and last cell along one axis within the radius around ``x``."""
-        ends = np.stack([x - radius_px, x + radius_px])
-        ends /= CELL_PX
-        np.maximum(ends, 0.0, out=ends)
-        np.minimum(ends, cells - 1.0, out=ends)
-        first, last = ends.astype(np.int64)
-        return first, last
+        query_uv, radius_px = np.asarray(query_uv, dtype=np.float64), np.asarray(radius_px, dtype=np.float64)
+        return _near(query_uv, radius_px, self._u, self._v, self._order, self._start, self._origin, self._columns)
 
 
-def _unroll(first: IntArray, counts: IntArray) -> tuple[IntArray, IntArray]:
-    """Expand integer intervals, given by first element and length, to (interval index, element) pairs."""
-    interval = np.repeat(np.arange(len(counts)), counts)
-    shift = first - np.cumsum(counts) + counts
-    return interval, np.arange(len(interval)) + shift[interval]
+@compiled
+def _near(
+    query_uv: FloatArray,
+    radius_px: FloatArray,
+    u: FloatArray,
+    v: FloatArray,
+    order: IntArray,
+    start: IntArray,
+    origin: FloatArray,
+    columns: int,
+) -> tuple[IntArray, IntArray]:
+    """Pairs of queries and keypoints; the keypoints sorted by cell, of which ``start`` holds the first of each."""
+    rows = (len(start) - 1) // columns
+    query, keypoint = np.empty(4 * len(query_uv), np.int64), np.empty(4 * len(query_uv), np.int64)
+    found = 0
+    for q in range(len(query_uv)):
+        x, y, r = query_uv[q, 0], query_uv[q, 1], radius_px[q]
+        left = int(max(math.floor((x - r - origin[0]) / CELL_PX), 0.0))
+        right = int(min(math.floor((x + r - origin[0]) / CELL_PX), columns - 1.0))
+        top = int(max(math.floor((y - r - origin[1]) / CELL_PX), 0.0))
+        bottom = int(min(math.floor((y + r - origin[1]) / CELL_PX), rows - 1.0))
+        if left > right:
+            continue
+        for row in range(top, bottom + 1):
+            # Keypoints of neighbouring cells in a row are contiguous.
+            for k in range(start[row * columns + left], start[row * columns + right + 1]):
+                if (u[k] - x) ** 2 + (v[k] - y) ** 2 <= r * r:
+                    if found == len(query):
+                        query, keypoint = np.append(query, np.empty_like(query)), np.append(keypoint, query)
+                    query[found], keypoint[found] = q, order[k]
+                    found += 1
+    return query[:found], keypoint[:found]

@@ -1,10 +1,12 @@
 """Projection of anchors into a camera and matching to its keypoints."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeslam_torch.compiled import compiled
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import Matches, best_pairs, hamming
 from edgeslam_torch.geometry.camera import Camera
@@ -35,20 +37,54 @@ def project_anchors(
 ) -> Projection:
     """Anchors that are in front, inside the image, at a distance and viewing angle similar to earlier
     observations."""
-    p_w = anchors.p_w[ids]
-    p_c = p_w @ T_c_w[:3, :3].T + T_c_w[:3, 3]
-    z = np.maximum(p_c[:, 2], 1e-9)
-    u = camera.fx * p_c[:, 0] / z + camera.cx
-    v = camera.fy * p_c[:, 1] / z + camera.cy
-    distance = np.linalg.norm(p_c, axis=1)
-    ray_w = p_w + T_c_w[:3, :3].T @ T_c_w[:3, 3]
-    cosine = (ray_w * anchors.normal[ids]).sum(1) / np.maximum(distance, 1e-12)
-    octave = np.log(np.maximum(anchors.max_distance[ids], 1e-12) / np.maximum(distance, 1e-12)) / np.log(scale_factor)
-    level = np.clip(np.rint(octave), 0, levels - 1).astype(np.int64)
-    seen = (p_c[:, 2] > 1e-3 * distance) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    # ORB does not match beyond 60 degrees or two pyramid levels outside the detector's range.
-    seen &= (cosine > 0.5) & (octave > -2.5) & (octave < levels + 1.5)
-    return Projection(ids[seen], np.stack([u, v], axis=1)[seen], p_c[seen, 2], level[seen])
+    K = camera.fx, camera.fy, camera.cx, camera.cy
+    size = camera.width, camera.height
+    T_c_w = np.ascontiguousarray(T_c_w)
+    return Projection(
+        *_project(anchors.p_w, anchors.normal, anchors.max_distance, ids, T_c_w, K, size, scale_factor, levels)
+    )
+
+
+@compiled
+def _project(
+    p_w: FloatArray,
+    normal: FloatArray,
+    max_distance: FloatArray,
+    ids: IntArray,
+    T_c_w: FloatArray,
+    K: tuple[float, float, float, float],
+    size: tuple[int, int],
+    scale_factor: float,
+    levels: int,
+) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
+    """The fields of a `Projection`."""
+    fx, fy, cx, cy = K
+    anchor, level = np.empty(len(ids), np.int64), np.empty(len(ids), np.int64)
+    uv, depth = np.empty((len(ids), 2)), np.empty(len(ids))
+    T, seen = T_c_w, 0
+    for id in ids:
+        a, b, c = p_w[id]
+        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
+        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        distance = math.sqrt(x * x + y * y + z * z)
+        if not z > max(1e-3 * distance, 1e-9):
+            continue
+        u, v = fx * x / z + cx, fy * y / z + cy
+        if not (0.0 <= u < size[0] and 0.0 <= v < size[1]):
+            continue
+        # ORB does not match beyond 60 degrees or two pyramid levels outside the detector's range.
+        p, q, r = normal[id]
+        towards = x * (T[0, 0] * p + T[0, 1] * q + T[0, 2] * r) + y * (T[1, 0] * p + T[1, 1] * q + T[1, 2] * r)
+        towards += z * (T[2, 0] * p + T[2, 1] * q + T[2, 2] * r)
+        octave = math.log(max(max_distance[id], 1e-12) / distance) / math.log(scale_factor)
+        if not (towards > 0.5 * distance and -2.5 < octave < levels + 1.5):
+            continue
+        anchor[seen], depth[seen] = id, z
+        uv[seen, 0], uv[seen, 1] = u, v
+        level[seen] = min(max(round(octave), 0), levels - 1)
+        seen += 1
+    return anchor[:seen], uv[:seen], depth[:seen], level[:seen]
 
 
 def match_projection(
