@@ -81,7 +81,7 @@ def _places(folder: Path) -> list[tuple[Path, str | Path]]:
 def _read(
     path: Path | None, inside: ImuReadings | None, folders: Sequence[Path], given: Given
 ) -> tuple[ImuModel, ImuReadings, list[str]]:
-    if path is not None and path.name == KINECT:
+    if path is not None and path.name == KINECT and given.model is None:
         readings, remarks = read_readings(path)
         model = ImuModel(rate_hz=readings.rate_hz, T_imu_cam=_T_KINECT_CAM, time_offset_s=0.0, source=KINECT)
         return model, readings, remarks
