@@ -6,13 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from small_depth import METADATA, small_depth
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.summary.writer import event_file_writer
 
-from edgeslam_torch.models.checkpoint import build_network
-from edgeslam_torch.models.fastdepth import Widths
-from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.callbacks import ProgressBar, TensorBoard
 from edgeslam_torch.train.hooks import Hooks
 from edgeslam_torch.train.recipe import train
@@ -20,7 +17,6 @@ from edgeslam_torch.train.signals import Source, Supervised
 from edgeslam_torch.train.state import TrainConfig, TrainState
 from edgeslam_torch.train.views.augment import View
 
-METADATA = Metadata(input_height=32, input_width=64, focal_px=50.0)
 VIEW = View(
     np.full((32, 64, 3), 90, np.uint8),
     np.full((32, 64), 2.0, np.float32),
@@ -42,11 +38,9 @@ class _Killed(Hooks):
 
 
 def run(out: Path, config: TrainConfig, *more: Hooks) -> TrainState:
-    torch.manual_seed(0)
-    network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
     hooks = [ProgressBar(), TensorBoard(out / "tensorboard", METADATA, [VIEW]), *more]
     signal = Supervised([Source("made", [VIEW], 1.0)], METADATA)
-    return train(network, METADATA, [signal], config, out, lambda n: {"score": 1.0}, hooks)
+    return train(small_depth(), METADATA, [signal], config, out, lambda n: {"score": 1.0}, hooks)
 
 
 def test_steps_are_in_tensorboard_once_after_interrupts_and_more_steps(

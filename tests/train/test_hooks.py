@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small_depth import METADATA, small_depth
 
 from edgeslam_torch.errors import ConfigError
-from edgeslam_torch.models.checkpoint import build_network
-from edgeslam_torch.models.fastdepth import Widths
-from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import (
     Data,
     DepthFolder,
@@ -29,7 +27,6 @@ from edgeslam_torch.train import (
 )
 from edgeslam_torch.train.recipes.finetune import settings_of
 
-METADATA = Metadata(input_height=32, input_width=64, focal_px=50.0)
 VIEW = View(
     np.full((32, 64, 3), 90, np.uint8),
     np.full((32, 64), 2.0, np.float32),
@@ -39,14 +36,9 @@ CONFIG = TrainConfig(steps=4, batch=2, warmup_steps=1, validate_every=2, checkpo
 EXAMPLES = Path(__file__).parents[2] / "examples" / "training_hooks.py"
 
 
-def tiny() -> torch.nn.Module:
-    torch.manual_seed(0)
-    return build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
-
-
 def run(out: Path, *hooks: Hooks, config: TrainConfig = CONFIG) -> TrainState:
     signal = Supervised([Source("made", [VIEW], 1.0)], METADATA)
-    return train(tiny(), METADATA, [signal], config, out, lambda n: {"score": 1.0, "abs_rel": 0.3}, hooks)
+    return train(small_depth(), METADATA, [signal], config, out, lambda n: {"score": 1.0, "abs_rel": 0.3}, hooks)
 
 
 class Diary(Hooks):
@@ -152,7 +144,7 @@ def test_fine_tuning_calls_hooks_and_is_not_resumed_with_other_losses(tmp_path: 
 
     def tune(*hooks: Hooks, steps: int = 2) -> int:
         with out_folder(tmp_path / "out") as out:
-            return finetune(tiny(), METADATA, data, replace(CONFIG, steps=steps), out, hooks=hooks).steps
+            return finetune(small_depth(), METADATA, data, replace(CONFIG, steps=steps), out, hooks=hooks).steps
 
     assert tune(StopAt(9), steps=2) == 2
     assert tune(steps=3) == 3  # who only watches may come and go

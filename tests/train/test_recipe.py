@@ -14,12 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small_depth import METADATA, SmallDepth
+from small_depth import small_depth as network
 from torch import Tensor
 
 from edgeslam_torch.errors import ConfigError, SourceError, WeightsError
-from edgeslam_torch.models.checkpoint import build_network, load_checkpoint
-from edgeslam_torch.models.fastdepth import FastDepth, Prediction, Widths
-from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.checkpoint import build_network
+from edgeslam_torch.models.fastdepth import Prediction, Variant, Widths
+from edgeslam_torch.models.trainable import DepthModule
+from edgeslam_torch.models.weights_file import read_header
 from edgeslam_torch.train import recipe
 from edgeslam_torch.train import state as state_file
 from edgeslam_torch.train.hooks import Drawn, Hooks
@@ -31,9 +34,7 @@ from edgeslam_torch.train.state import TrainConfig, TrainState, saved_step
 from edgeslam_torch.train.validate import image_tensor
 from edgeslam_torch.train.views.augment import AugmentConfig, View
 
-METADATA = Metadata(input_height=32, input_width=64, focal_px=50.0)
-TINY = Widths((4,) + (8,) * 13, (8,) * 5)
-CONFIG = TrainConfig(steps=6, batch=4, warmup_steps=2, validate_every=3, checkpoint_every=2, frozen_stages=1)
+CONFIG = TrainConfig(steps=6, batch=4, warmup_steps=2, validate_every=3, checkpoint_every=2, frozen_stages=0)
 STILL = AugmentConfig(0, (1, 1), 0, 0, 0, 0, 0, 0, 0, 0, (1, 1), 0, 0, 0)
 
 
@@ -42,11 +43,6 @@ def views(count: int = 3) -> list[View]:
     K = np.array([[50.0, 0, 31.5], [0, 50.0, 15.5], [0, 0, 1]])
     depth = np.linspace(1, 4, 64, dtype=np.float32)[None].repeat(32, 0)
     return [View(rng.integers(0, 256, (32, 64, 3), np.uint8), depth + i, K) for i in range(count)]
-
-
-def network(seed: int = 0) -> FastDepth:
-    torch.manual_seed(seed)
-    return build_network(METADATA, TINY)
 
 
 def signal(augment: AugmentConfig | None = None) -> Supervised:
@@ -104,7 +100,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> TrainState:
     return run(tmp_path_factory.mktemp("whole"))
 
 
-@pytest.mark.parametrize("step", [1, 2, 3, 5, 6])
+@pytest.mark.parametrize("step", [1, 2, 3, 6])
 def test_killed_and_resumed_run_ends_with_the_same_weights(whole: TrainState, killed: Path, step: int) -> None:
     assert_same(whole, run(killed / f"step{step}"))
 
@@ -120,7 +116,7 @@ def test_interrupt_and_broken_hook_lose_no_step(whole: TrainState, tmp_path: Pat
 
 
 def test_interrupt_in_the_validation_is_validated_after_the_resume(whole: TrainState, tmp_path: Path) -> None:
-    def interrupted(_: FastDepth) -> dict[str, float]:
+    def interrupted(_: DepthModule) -> dict[str, float]:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -191,7 +187,7 @@ def test_damaged_state_is_named(tmp_path: Path, content: bytes) -> None:
 def test_state_of_another_network_is_named(tmp_path: Path) -> None:
     run(tmp_path)
     with pytest.raises(WeightsError, match=r"last\.pt: .*another network"):
-        train(build_network(METADATA, Widths((8,) * 14, (8,) * 5)), METADATA, [signal()], CONFIG, tmp_path)
+        train(SmallDepth(width=16), METADATA, [signal()], CONFIG, tmp_path)
 
 
 def test_finished_run_is_not_trained_further(tmp_path: Path) -> None:
@@ -199,7 +195,7 @@ def test_finished_run_is_not_trained_further(tmp_path: Path) -> None:
     before = (tmp_path / "final.safetensors").read_bytes()
     assert run(tmp_path).step == 6
     assert (tmp_path / "final.safetensors").read_bytes() == before
-    assert load_checkpoint(tmp_path / "final.safetensors")[1] == METADATA
+    assert read_header(tmp_path / "final.safetensors") == METADATA
 
 
 @pytest.mark.slow
@@ -212,10 +208,10 @@ def test_one_batch_is_learnt_almost_to_zero(tmp_path: Path) -> None:
 
     weights = SupervisedWeights(uncertainty=0.0, gradient=0.1)
     one = Supervised([Source("one", views(1), 1.0)], METADATA, STILL, weights)
-    wide = Widths((8,) + (16,) * 13, (16,) * 5)
     torch.manual_seed(0)
+    wide = build_network(fast := replace(METADATA, variant=Variant.SKIPADD.value), Widths((8,) + (16,) * 13, (16,) * 5))
     config = TrainConfig(steps=250, batch=1, lr=2e-2, encoder_lr=5e-3, frozen_stages=0, warmup_steps=10, weight_decay=0)
-    train(build_network(METADATA, wide), METADATA, [one], config, tmp_path, hooks=[Record()])
+    train(wide, fast, [one], config, tmp_path, hooks=[Record()])
     assert losses[0] > 0.5
     assert np.mean(losses[-20:]) < 0.03
 
@@ -268,8 +264,7 @@ def longer(tmp_path_factory: pytest.TempPathFactory) -> tuple[TrainConfig, Train
     return config, run(tmp_path_factory.mktemp("longer"), config)
 
 
-@pytest.mark.parametrize("factor", [1e3, 1e30, torch.nan])
-@pytest.mark.parametrize("step", [4, 5])
+@pytest.mark.parametrize(("factor", "step"), [(1e3, 5), (1e30, 4), (torch.nan, 5)])
 def test_last_state_is_a_working_network_after_a_divergence(
     longer: tuple[TrainConfig, TrainState], tmp_path: Path, factor: float, step: int
 ) -> None:
@@ -347,13 +342,13 @@ def test_early_stopping_counts_validations_without_progress(tmp_path: Path) -> N
 
 def test_frozen_parts_do_not_move_and_their_statistics_neither(tmp_path: Path) -> None:
     before = network().state_dict()
-    config = replace(CONFIG, frozen_stages=14, freeze_norm=True)
+    config = replace(CONFIG, frozen_stages=1, freeze_norm=True)
     after = train(network(), METADATA, [signal()], config, tmp_path).network.state_dict()
     for name, value in before.items():
         moved = not torch.equal(value, after[name])
-        if name.startswith("conv") or "running" in name:
+        if name.startswith("coder") or "running" in name:
             assert not moved, name
-    assert not torch.equal(before["decode_conv3.1.0.weight"], after["decode_conv3.1.0.weight"])
+    assert not torch.equal(before["head.weight"], after["head.weight"])
 
 
 def test_learning_rate_rises_then_falls() -> None:
@@ -430,7 +425,7 @@ def test_two_processes_on_two_recordings_give_the_single_process_result(tmp_path
         assert (off > 1e-4).double().mean() < 1e-3 and off.max() < 1e-3
 
 
-@pytest.mark.parametrize("parts", [2, 3, 5])
+@pytest.mark.parametrize("parts", [2, 5])
 def test_parts_of_a_batch_give_the_step_of_the_whole(tmp_path: Path, parts: int) -> None:
     config = shared_config(frozen=True)
     whole = train(network(), METADATA, [two_recordings()], config, tmp_path / "whole").network.state_dict()
@@ -540,7 +535,7 @@ def test_float16_leaves_out_steps_that_overflow(tmp_path: Path, monkeypatch: pyt
     state = run(tmp_path, replace(CONFIG, steps=40, validate_every=40), [Record()])
     assert scales[0] == 2.0**39, "halved by an overflow"
     assert scales[-1] == scales[-2], "until it fits"
-    assert not torch.equal(state.network.state_dict()["decode_conv3.1.0.weight"], before["decode_conv3.1.0.weight"])
+    assert not torch.equal(state.network.state_dict()["head.weight"], before["head.weight"])
     assert all(torch.isfinite(p).all() for p in state.network.parameters())
     again = run(tmp_path, replace(CONFIG, steps=41, validate_every=41))
     assert again.scaler.get_scale() == scales[-1], "a resume remembers it"
