@@ -100,6 +100,7 @@ def imports() -> dict[str, list[str]]:
     return {module_name(path): list(imported(statements(parsed(path)), MODULES)) for path in sources()}
 
 
+@cache
 def parsed(path: Path) -> ast.Module:
     """Syntax tree of a file."""
     return ast.parse(path.read_text(encoding="utf-8"))

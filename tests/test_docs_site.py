@@ -122,12 +122,6 @@ def imported_names() -> set[str]:
     return {name.name for node in found if (node.module or "").startswith("edgeslam_torch") for name in node.names}
 
 
-@pytest.mark.parametrize("name", [name for names in reference.NAMES.values() for name in names])
-def test_what_the_reference_lists_exists(name: str) -> None:
-    module, _, thing = name.rpartition(".")
-    assert hasattr(importlib.import_module(f"edgeslam_torch.{module}"), thing)
-
-
 def test_every_setting_has_its_default_and_its_reason() -> None:
     rows = re.findall(r"^\| `(\w+)` \| `([^`]+)`[^|]* \| (.+) \|$", reference.settings_page(), re.MULTILINE)
     config = tomllib.loads(to_toml(SlamConfig()))

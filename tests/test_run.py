@@ -337,14 +337,6 @@ def test_error_in_the_system_itself_loses_nothing(tmp_path, write_tum):
     assert len(np.loadtxt(tmp_path / "out" / "trajectory.txt")) == 3
 
 
-def test_offline_twice_gives_the_same_bytes(tmp_path, write_tum):
-    folder = write_tum(tmp_path / "seq", 6)
-    for name in ("a", "b"):
-        run(open_source(folder), tmp_path / name, make_slam=fake(FakeSlam()))
-    for name in ("trajectory.txt", "edge_map.ply", "config.toml"):
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-
-
 def frames_at(stamps):
     image = np.zeros((4, 4), np.uint8)
     return iter([Frame(i, stamp, image) for i, stamp in enumerate(stamps)])

@@ -8,7 +8,7 @@ import pytest
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.demo import DemoSettings, map_accuracy, record, run_and_judge
-from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.errors import OutputError
 from edgeslam_torch.readers.source import open_source
 
 
@@ -114,10 +114,3 @@ def test_wrong_options_are_told_in_one_line(
     error = capsys.readouterr().err.strip()
     assert message in error
     assert "\n" not in error
-
-
-def test_settings_refuse_nonsense() -> None:
-    with pytest.raises(ConfigError, match="no world"):
-        DemoSettings(world="moon")
-    assert DemoSettings(seconds=2.0, rate_hz=20.0).frames == 40
-    assert np.isclose(DemoSettings().camera.fx, 925.0 / 1.5)

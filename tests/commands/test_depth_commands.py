@@ -100,12 +100,6 @@ def test_two_images_of_one_name_are_two_depth_maps(weights: Path, pictures: Path
     assert not np.array_equal(np.load(maps[0]), np.load(maps[1]))
 
 
-def test_depth_into_a_file_is_one_line(weights: Path, pictures: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("mine")
-    with pytest.raises(EdgeSlamError, match="file: cannot be written"):
-        run("depth", pictures, "--out", tmp_path / "file", "--weights", weights)
-
-
 def test_depth_maps_that_cannot_be_meant_are_unknown_and_counted(
     weights: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,14 +111,6 @@ def test_depth_maps_that_cannot_be_meant_are_unknown_and_counted(
     assert "2 of 2 depth maps are mostly unknown" in capsys.readouterr().out
     assert np.isnan(np.load(tmp_path / "out" / "img0.npy")).all()
     assert not cv2.imread(str(tmp_path / "out" / "img0.png"), cv2.IMREAD_UNCHANGED).any()
-
-
-def test_help_of_depth_names_every_file_and_its_unit(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        run("depth", "--help")
-    said = capsys.readouterr().out
-    for word in ("STEM.npy", "STEM.png", "STEM_colour.png", "STEM_sigma.npy", "metres", "millimetres", "NaN"):
-        assert word in said
 
 
 @pytest.mark.parametrize("option", ["--threads", "--max-frames"])
@@ -141,11 +127,6 @@ def test_depth_of_one_image_uses_the_camera_beside_it(weights: Path, pictures: P
     run("depth", pictures / "img2.png", "--out", tmp_path / "b", "--weights", weights, "--camera", "kinect")
     a, b = np.load(tmp_path / "a" / "img2.npy"), np.load(tmp_path / "b" / "img2.npy")
     np.testing.assert_allclose(b / a, 525.0 / 4 / 130.0, rtol=1e-3)
-
-
-def test_missing_image_is_one_line(weights: Path, tmp_path: Path) -> None:
-    with pytest.raises(EdgeSlamError, match=r"none\.png"):
-        run("depth", tmp_path / "none.png", "--out", tmp_path, "--weights", weights)
 
 
 @pytest.mark.slow

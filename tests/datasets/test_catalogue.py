@@ -24,11 +24,6 @@ def test_every_entry_can_be_fetched_and_says_its_terms():
         assert set(names) <= recordings.keys()
 
 
-def test_two_archives_never_share_a_file_name():
-    archives = {recording.archive for recording in catalogue()[0].values()}
-    assert len({archive.file for archive in archives}) == len(archives)
-
-
 def test_names_patterns_and_sets_stand_for_recordings_once():
     assert [r.name for r in chosen(["tum_fr1_xyz", "tum_fr1_*z", "tum_fr1_desk"])] == ["tum_fr1_xyz", "tum_fr1_desk"]
     assert "7scenes_redkitchen/seq-01" in [r.name for r in chosen(["readme"])]

@@ -68,7 +68,7 @@ def test_no_candidates():
 candidates = st.lists(st.tuples(st.integers(0, 8), st.integers(0, 8), st.integers(0, 90)), max_size=60)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(candidates)
 def test_best_pairs_are_one_to_one_within_limits_and_nearest(rows):
     unique = {(q, t): d for q, t, d in rows}

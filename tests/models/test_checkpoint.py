@@ -11,7 +11,7 @@ import torch
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Variant
-from edgeslam_torch.models.record import SHIPPED_WEIGHTS, Metadata
+from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.weights_file import read_header
 
 
@@ -59,8 +59,10 @@ def test_plain_torch_state_dict_is_read_as_upstreams(tmp_path: Path) -> None:
     assert torch.equal(loaded.state_dict()["conv3.3.weight"], network.state_dict()["conv3.3.weight"])
 
 
-@pytest.mark.parametrize("prefix", ["", "module.", "_orig_mod.", "model.", "model._orig_mod.module."])
-@pytest.mark.parametrize("key", [None, "model", "state_dict", "model_state_dict"])
+@pytest.mark.parametrize(
+    ("prefix", "key"),
+    [("module.", None), ("_orig_mod.", "model"), ("model._orig_mod.module.", "state_dict"), ("", "model_state_dict")],
+)
 def test_wrappers_around_a_network_are_taken_off_and_no_origin_is_made_up(tmp_path, prefix, key, caplog) -> None:
     network = FastDepth(Variant.PRUNED)
     state = {prefix + name: value for name, value in network.state_dict().items()}
@@ -98,13 +100,3 @@ def test_pickled_module_is_refused_with_the_remedy(tmp_path: Path) -> None:
     torch.save({"model": parts}, tmp_path / "whole.pth.tar")
     with pytest.raises(WeightsError, match="edgeslam weights convert"):
         load_checkpoint(tmp_path / "whole.pth.tar")
-
-
-@pytest.mark.parametrize("name", SHIPPED_WEIGHTS)
-def test_shipped_weights_are_small_and_say_what_they_are(name: str) -> None:
-    assert SHIPPED_WEIGHTS[name].stat().st_size <= 8_000_000
-    metadata = read_header(SHIPPED_WEIGHTS[name])
-    assert metadata.units == "m"
-    assert metadata.licence
-    assert metadata.data
-    assert not any("xyz" in name or "kitchen" in name for name in metadata.data)

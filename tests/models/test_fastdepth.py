@@ -6,7 +6,7 @@ import torch
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.complexity import measure_complexity
 from edgeslam_torch.models.fastdepth import FULL, PRUNED, FastDepth, Output, Variant, Widths
-from edgeslam_torch.models.mobilenet import Padding, SameConv2d
+from edgeslam_torch.models.mobilenet import SameConv2d
 
 
 @pytest.mark.parametrize(
@@ -77,9 +77,3 @@ def test_same_padding_centres_on_odd_pixels() -> None:
     x = torch.zeros(1, 1, 4, 4)
     x[0, 0, 2, 2] = 1.0
     assert layer(x)[0, 0].tolist() == [[1.0, 1.0], [1.0, 1.0]]
-
-
-def test_padding_changes_every_strided_layer() -> None:
-    strided = [m for m in FastDepth(padding=Padding.TF_SAME).modules() if isinstance(m, SameConv2d)]
-    assert len(strided) == 5
-    assert not any(isinstance(m, SameConv2d) for m in FastDepth().modules())

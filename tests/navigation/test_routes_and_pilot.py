@@ -352,8 +352,8 @@ def test_lost_tracking_resets_no_obstacles():
 def test_overridden_time_is_no_lack_of_progress():
     pilot = before_a_free_way()
     closed(pilot)
-    assert set(stays(pilot, 30.0, overridden=True)) == {Phase.FLYING}
-    assert Phase.RISING in stays(pilot, 16.0, 30.0)
+    assert set(stays(pilot, 17.0, overridden=True)) == {Phase.FLYING}
+    assert Phase.RISING in stays(pilot, 16.0, 17.0)
 
 
 def test_map_correction_is_no_progress():

@@ -15,8 +15,6 @@ from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.types import Frame
 from edgeslam_torch.writers.flight_writer import FlightWriter
 
-pytestmark = pytest.mark.timeout(1200)  # ten thousand cases on a machine that does other things too
-
 NUMBERS = st.one_of(
     st.floats(), st.integers(-(10**20), 10**20), st.sampled_from(["", "nan", "1e999", "0x3", "٣", "\0"])
 )
@@ -63,14 +61,14 @@ def damaged(flight, name, data):
 
 
 @pytest.mark.slow
-@settings(max_examples=4000, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=400, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=TELEMETRY)
 def test_any_telemetry_in_a_flight(flight, data):
     damaged(flight, "telemetry.csv", data)
 
 
 @pytest.mark.slow
-@settings(max_examples=3000, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=400, deadline=None, suppress_health_check=list(HealthCheck))
 @given(name=st.sampled_from(["rgb.txt", "camera.yaml", "telemetry.csv", "state.txt"]), share=st.floats(0.0, 1.0))
 def test_a_flight_cut_off_anywhere(flight, name, share):
     whole = (flight / name).read_bytes()
@@ -78,7 +76,7 @@ def test_a_flight_cut_off_anywhere(flight, name, share):
 
 
 @pytest.mark.slow
-@settings(max_examples=3000, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=400, deadline=None, suppress_health_check=list(HealthCheck))
 @given(text=st.one_of(LISTINGS, st.text(max_size=60)), name=st.sampled_from(["rgb.txt", "camera.yaml", "state.txt"]))
 def test_any_listing_or_calibration_in_a_flight(flight, text, name):
     damaged(flight, name, text.encode("utf-8", "surrogatepass"))
@@ -88,19 +86,19 @@ COMMANDS = st.sampled_from(["takeoff", "land", "go 20 0 0 30", "battery?", "atti
 
 
 @pytest.mark.slow
-@settings(max_examples=10_000, deadline=None)
+@settings(max_examples=1000, deadline=None)
 @given(
     command=COMMANDS, answer=st.one_of(st.text(max_size=60), st.binary(max_size=60).map(lambda b: b.decode("latin1")))
 )
-def test_ten_thousand_answers_belong_or_do_not(command, answer):
+def test_answers_belong_or_do_not(command, answer):
     if belongs_to(command, answer) and not is_refusal(answer) and not command.endswith("?"):
         assert answer.lower().startswith(("ok", "forced stop"))
 
 
 @pytest.mark.slow
-@settings(max_examples=10_000, deadline=None)
+@settings(max_examples=1000, deadline=None)
 @given(lines=st.lists(st.one_of(st.text(max_size=40), COMMANDS), max_size=6))
-def test_ten_thousand_conversations_are_answered_in_the_drones_own_words(lines):
+def test_conversations_are_answered_in_the_drones_own_words(lines):
     interpreter = Interpreter(DroneModel())
     interpreter.run("command")
     for line in lines:

@@ -55,7 +55,7 @@ def use(folder):
 
 
 @pytest.mark.slow
-@settings(max_examples=1500, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(text=LISTS)
 def test_any_image_list(folder, text):
     (folder / "rgb.txt").write_text(text, encoding="utf-8", errors="surrogatepass")
@@ -64,7 +64,7 @@ def test_any_image_list(folder, text):
 
 
 @pytest.mark.slow
-@settings(max_examples=1500, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(text=CALIBRATIONS)
 def test_any_calibration(folder, text):
     (folder / "camera.yaml").write_text(text, encoding="utf-8", errors="surrogatepass")

@@ -65,11 +65,6 @@ def test_a_jpeg_that_is_none_or_of_another_size_is_left_out(entry, tmp_path):
     ]
 
 
-def test_missing_file_is_said(tmp_path):
-    with pytest.raises(SourceError, match="no such file"):
-        read_frame(ImageEntry(0, 0.0, tmp_path / "none.jpg"))
-
-
 @pytest.mark.parametrize("what", ["noise", "text", "zeros", "missing"])
 def test_a_jpeg_with_garbage_inside_is_left_out_and_named(entry, what):
     """OpenCV gives a picture for each of these and says nothing."""

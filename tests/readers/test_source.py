@@ -33,12 +33,6 @@ def test_frames_can_be_had_again_and_are_the_same(tmp_path, write_tum):
     assert all(np.array_equal(a.image, b.image) and a.stamp_s == b.stamp_s for a, b in zip(first, second, strict=True))
 
 
-def test_max_frames(tmp_path, write_tum):
-    source = open_source(write_tum(tmp_path, 6), max_frames=2)
-    assert source.length == 2
-    assert len(list(source.frames())) == 2
-
-
 def test_seven_scenes_as_published(tmp_path, write_images):
     folder = tmp_path / "seq-01"
     write_images(folder, [f"frame-{i:06d}.{kind}.png" for i in range(3) for kind in ("color", "depth")], (640, 480))
@@ -208,16 +202,6 @@ def test_sixteen_bit_and_alpha_images_become_eight_bit(tmp_path):
 # -- sources that cannot be used ---------------------------------------------------------------------------------
 
 
-def test_missing_folder(tmp_path):
-    with pytest.raises(SourceError, match="no such file or folder"):
-        open_source(tmp_path / "nowhere")
-
-
-def test_empty_folder(tmp_path):
-    with pytest.raises(SourceError, match="empty; give a folder of images"):
-        open_source(tmp_path)
-
-
 def test_folder_without_images(tmp_path):
     (tmp_path / "letter.docx").write_text("x")
     with pytest.raises(SourceError, match=r"found \.docx"):
@@ -262,11 +246,6 @@ def test_one_image_is_a_source(tmp_path, write_images):
     assert [f.index for f in open_source(path).frames()] == [0]
 
 
-def test_missing_telemetry_file(tmp_path, write_tum):
-    with pytest.raises(SourceError, match="no such telemetry file"):
-        open_source(write_tum(tmp_path, 2), telemetry=tmp_path / "t.csv")
-
-
 # -- calibration -------------------------------------------------------------------------------------------------
 
 
@@ -305,11 +284,6 @@ def test_impossible_lens_is_refused(tmp_path, write_tum):
     save_camera(folder / "camera.yaml", Camera(64, 48, 40.0, 40.0, 31.5, 23.5, (1e300, 0.0, 0.0, 0.0, 0.0)))
     with pytest.raises(CalibrationError, match="camera.yaml: distortion .* cannot be a lens's"):
         open_source(folder)
-
-
-def test_unknown_preset(tmp_path, write_tum):
-    with pytest.raises(CalibrationError, match="tum_fr1"):
-        open_source(write_tum(tmp_path, 2), camera="tum_fr9")
 
 
 # -- read-ahead --------------------------------------------------------------------------------------------------

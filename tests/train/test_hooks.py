@@ -13,7 +13,6 @@ from edgeslam_torch.train import (
     Data,
     DepthFolder,
     Drawn,
-    FromRuns,
     Hooks,
     Source,
     Supervised,
@@ -25,7 +24,6 @@ from edgeslam_torch.train import (
     out_folder,
     train,
 )
-from edgeslam_torch.train.recipes.finetune import settings_of
 
 VIEW = View(
     np.full((32, 64, 3), 90, np.uint8),
@@ -150,13 +148,6 @@ def test_fine_tuning_calls_hooks_and_is_not_resumed_with_other_losses(tmp_path: 
     assert tune(steps=3) == 3  # who only watches may come and go
     with pytest.raises(ConfigError, match=r"losses_of: None then, \['.*test_hooks:Zero'\] now"):
         tune(Zero(), steps=4)
-
-
-def test_settings_name_hooks_and_those_that_change_losses() -> None:
-    settings = settings_of(CONFIG, FromRuns.TEACHER, {}, [Zero(), StopAt(1)])
-    assert [name.rpartition(":")[2] for name in settings["hooks"]] == ["StopAt", "Zero"]
-    assert [name.rpartition(":")[2] for name in settings["losses_of"]] == ["Zero"]
-    assert {"hooks", "losses_of"}.isdisjoint(settings_of(CONFIG, FromRuns.TEACHER, {}))
 
 
 def test_hooks_are_found_in_files_and_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -103,8 +103,3 @@ def test_tensors_of_another_network_are_refused(tmp_path: Path) -> None:
         restored(nn.Conv2d(3, 1, 3), tmp_path / "w.safetensors")
     with pytest.raises(WeightsError, match="cannot read"):
         restored(Rows(), tmp_path / "none.safetensors")
-
-
-def test_a_network_without_predict_says_so() -> None:
-    with pytest.raises(NotImplementedError, match="must define predict"):
-        DepthModule().predict_half(torch.zeros(1, 3, 32, 32))

@@ -295,6 +295,7 @@ def test_interrupt_after_an_explosion_saves_no_ruin(tmp_path: Path) -> None:
         {"seed": -1},
         {"patience": -1},
         {"validate_every": 0},
+        {"accumulate": 5},
     ],
 )
 def test_settings_that_cannot_train_are_refused(wrong: dict[str, float]) -> None:
@@ -357,11 +358,6 @@ def test_learning_rate_rises_then_falls() -> None:
     assert max(factors) == factors[9] == pytest.approx(1.0)
     assert factors[-1] == pytest.approx(0.01, abs=0.002)
     assert all(a >= b for a, b in zip(factors[9:], factors[10:], strict=False))
-
-
-def test_mixed_precision_trains(tmp_path: Path) -> None:
-    state = run(tmp_path, replace(CONFIG, steps=2, amp=True))
-    assert all(torch.isfinite(p).all() for p in state.network.parameters())
 
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
@@ -433,11 +429,6 @@ def test_parts_of_a_batch_give_the_step_of_the_whole(tmp_path: Path, parts: int)
     state = train(network(), METADATA, [two_recordings()], divided, tmp_path / "parts").network.state_dict()
     for name, value in whole.items():
         torch.testing.assert_close(state[name], value, rtol=1e-4, atol=1e-4, msg=name)
-
-
-def test_more_parts_than_images_are_refused() -> None:
-    with pytest.raises(ValueError, match="accumulate must be at most the batch, 4, got 5"):
-        replace(CONFIG, accumulate=5)
 
 
 def test_workers_draw_the_same_batches(whole: TrainState, tmp_path: Path) -> None:

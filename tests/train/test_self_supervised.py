@@ -112,7 +112,7 @@ def test_every_term_is_smallest_at_the_true_depth(sequence: PosedSequence) -> No
     assert at[1.0]["points"].max() < 0.05
 
 
-@pytest.mark.parametrize("k", range(6))
+@pytest.mark.parametrize("k", range(2))
 def test_what_is_drawn_is_the_run_in_metres(sequence: PosedSequence, k: int) -> None:
     """Brought to metres, baselines and depths are twice as long; points lie where the zoom puts them."""
     slot = Slot(3, 0, k)

@@ -6,9 +6,8 @@ import numpy as np
 from fake_slam import FakeSlam
 
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.types import DepthMap, Frame, FrameStatus
+from edgeslam_torch.types import DepthMap, Frame
 from edgeslam_torch.viewer import live_view
-from edgeslam_torch.viewer import rerun_viewer as viewer
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
@@ -53,7 +52,3 @@ def test_depth_that_is_dropped_while_it_is_shown(monkeypatch):
     monkeypatch.setattr(slam, "keyframes", lambda: [Measured()])
     view.on_frame(frame, output, slam)
     assert len(view._viewer.depth) == 1
-
-
-def test_every_status_has_a_colour():
-    assert set(viewer._STATUS_COLOURS) == {str(status) for status in FrameStatus}

@@ -155,7 +155,7 @@ def test_movements_on_the_ground_are_refused():
     assert interpreter.run("up 50").text == "error Not joystick"
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(st.one_of(st.text(max_size=60), st.sampled_from(["go", "rc", "curve", "forward", "speed", "flip"]).flatmap(
     lambda w: st.lists(st.text(max_size=5), max_size=8).map(lambda a: " ".join([w, *a])))))  # fmt: skip
 def test_any_line_is_answered(line):

@@ -82,6 +82,7 @@ def test_exported_file_holds_opset_and_metadata_and_agrees(tmp_path: Path) -> No
         np.testing.assert_allclose(ours, theirs.numpy(), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_open_dimensions_take_any_batch_and_size(tmp_path: Path) -> None:
     network = random_network(METADATA)
     path = tmp_path / "model.onnx"

@@ -214,15 +214,6 @@ def test_threads_do_not_change_the_images(tmp_path: Path, home: World, flight: F
     assert all((tmp_path / "1" / f).read_bytes() == (tmp_path / "3" / f).read_bytes() for f in files)
 
 
-def test_written_telemetry_has_the_sdk_header(tmp_path: Path, flight: Flight) -> None:
-    log = simulate(np.random.default_rng(0), flight.stamps_s, flight.T_w_c, flight.T_b_c)
-    log.write(tmp_path / "telemetry.csv")
-    lines = (tmp_path / "telemetry.csv").read_text().splitlines()
-    assert lines[0] == "stamp_s,vgx,vgy,vgz,pitch,roll,yaw,tof,h,baro,bat,agx,agy,agz"
-    assert len(lines) == len(log.stamps_s) + 1
-    assert all(cell.lstrip("-").isdigit() for cell in lines[40].split(",")[1:9])
-
-
 def test_csv_reader_agrees_with_our_own_conversion(tmp_path: Path, flight: Flight) -> None:
     log = simulate(np.random.default_rng(0), flight.stamps_s, flight.T_w_c, flight.T_b_c)
     log.write(tmp_path / "telemetry.csv")

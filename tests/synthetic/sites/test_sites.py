@@ -21,7 +21,7 @@ def looking(T_w_c_site, yaw):
 
 
 @pytest.mark.parametrize("name", QUICK)
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [3])
 def test_start_and_goal_are_free_and_the_same_seed_gives_the_same_site(name, seed):
     site = named_site(name, seed)
     above = np.array([[0.0, 0.0, z] for z in np.linspace(0.1, 1.2, 12)])
