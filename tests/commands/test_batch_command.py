@@ -48,10 +48,10 @@ def test_missing_ray_is_named_with_its_extra(tmp_path, monkeypatch, write_images
 
 
 @pytest.fixture(scope="module")
-def ten_recordings(tmp_path_factory):
-    """Seven short simulated flights, and three broken recordings."""
+def recordings(tmp_path_factory):
+    """Four short simulated flights, and three broken recordings."""
     folder = tmp_path_factory.mktemp("fleet") / "recordings"
-    for seed in range(7):
+    for seed in range(4):
         record(folder / f"flight_{seed}", DemoSettings("corridor", 2.0, 15.0, seed, width=320, height=240))
     (folder / "empty").mkdir()
     (folder / "clip.mp4").write_bytes(b"no video")
@@ -80,9 +80,9 @@ def flight_process(out, name):
 
 
 @pytest.mark.slow
-def test_three_of_ten_broken_and_a_process_killed(ten_recordings, tmp_path):
+def test_three_of_seven_broken_and_a_process_killed(recordings, tmp_path):
     out = tmp_path / "out"
-    process = subprocess.Popen(batch_command(ten_recordings, out, "--jobs", "2"), stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(batch_command(recordings, out, "--jobs", "2"), stderr=subprocess.PIPE, text=True)
     os.kill(flight_process(out, "flight_3"), signal.SIGKILL)
     _, said = process.communicate(timeout=280)
     assert process.returncode == 1, said
@@ -91,49 +91,36 @@ def test_three_of_ten_broken_and_a_process_killed(ten_recordings, tmp_path):
     assert "not a video" in rows["clip.mp4"]["reason"]
     assert rows["flight_3"]["attempts"] == "2"
     assert all(row["attempts"] == "1" for name, row in rows.items() if name != "flight_3")
-    assert all(float(rows[f"flight_{i}"]["ate_m"]) < 0.2 for i in range(7))
-    # The folders are runs like any other: training takes them as they are.
-    runs = sorted((out / "flights").iterdir())[:3]
-    command = [
-        sys.executable,
-        "-m",
-        "edgeslam_torch.cli",
-        "finetune",
-        *map(str, runs),
-        "--out",
-        str(tmp_path / "tuned"),
-    ]
-    done = subprocess.run([*command, "--from-runs", "pairs", "--steps", "1", "--batch", "2"])
-    assert done.returncode == 0
+    assert all(float(rows[f"flight_{i}"]["ate_m"]) < 0.2 for i in range(4))
 
 
 @pytest.mark.slow
-def test_ctrl_c_and_a_killed_batch_leave_what_is_finished(ten_recordings, tmp_path):
+def test_ctrl_c_and_a_killed_batch_leave_what_is_finished(recordings, tmp_path):
     out = tmp_path / "out"
-    process = subprocess.Popen(batch_command(ten_recordings, out, "--jobs", "1"), stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(batch_command(recordings, out, "--jobs", "1"), stderr=subprocess.PIPE, text=True)
     flight_process(out, "flight_2")
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "interrupted; " in said
     states = {name: row["state"] for name, row in rows_of(out).items()}
-    assert (states["flight_1"], states["flight_2"], states["flight_6"]) == ("done", "waiting", "waiting")
-    process = subprocess.Popen(batch_command(ten_recordings, out, "--jobs", "1"), stderr=subprocess.DEVNULL)
+    assert (states["flight_1"], states["flight_2"], states["flight_3"]) == ("done", "waiting", "waiting")
+    process = subprocess.Popen(batch_command(recordings, out, "--jobs", "1"), stderr=subprocess.DEVNULL)
     child = os.pidfd_open(flight_process(out, "flight_3"))
     process.kill()
     process.wait()
     assert select.select([child], [], [], 30.0)[0], "the flight's process ends with the batch"
     os.close(child)
-    done = subprocess.run(batch_command(ten_recordings, out, "--jobs", "2"), capture_output=True, text=True)
-    assert "3 of 10 flights were done before" in done.stderr
-    assert sum(row["state"] == "done" for row in rows_of(out).values()) == 7
+    done = subprocess.run(batch_command(recordings, out, "--jobs", "2"), capture_output=True, text=True)
+    assert "3 of 7 flights were done before" in done.stderr
+    assert sum(row["state"] == "done" for row in rows_of(out).values()) == 4
 
 
 @pytest.mark.slow
-def test_ray_gives_the_same_results(ten_recordings, tmp_path):
+def test_ray_gives_the_same_results(recordings, tmp_path):
     pytest.importorskip("ray", reason="needs the [fleet] extra: Ray is not installed")
     manifest = tmp_path / "three.csv"
-    manifest.write_text(f"recording\n{ten_recordings}/flight_1\n{ten_recordings}/empty\n{ten_recordings}/flight_4\n")
+    manifest.write_text(f"recording\n{recordings}/flight_1\n{recordings}/empty\n{recordings}/flight_3\n")
     for name, options in (("here", ["--jobs", "2"]), ("ray", RAY)):
         done = subprocess.run(batch_command(manifest, tmp_path / name, *options), capture_output=True, text=True)
         assert done.returncode == 1, done.stderr
@@ -144,17 +131,17 @@ def test_ray_gives_the_same_results(ten_recordings, tmp_path):
 
 
 @pytest.mark.slow
-def test_ctrl_c_on_ray_leaves_no_process(ten_recordings, tmp_path):
+def test_ctrl_c_on_ray_leaves_no_process(recordings, tmp_path):
     pytest.importorskip("ray", reason="needs the [fleet] extra: Ray is not installed")
     out = tmp_path / "out"
-    process = subprocess.Popen(batch_command(ten_recordings, out, *RAY), stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(batch_command(recordings, out, *RAY), stderr=subprocess.PIPE, text=True)
     child = os.pidfd_open(flight_process(out, "flight_1"))
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=100)
     assert process.returncode == 130, said
     assert select.select([child], [], [], 30.0)[0], "the flight's process ends with its Ray worker"
     os.close(child)
-    assert sum(row["state"] == "waiting" for row in rows_of(out).values()) >= 3
+    assert sum(row["state"] == "waiting" for row in rows_of(out).values()) >= 1
 
 
 @pytest.mark.slow

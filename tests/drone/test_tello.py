@@ -26,7 +26,7 @@ from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
 from edgeslam_torch.drone.tello import Tello, TelloAddress, TelloError, TelloLimits
 from edgeslam_torch.errors import MissingPackageError, SourceError
 
-av = pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
+pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
 
 
 @pytest.fixture
@@ -137,23 +137,9 @@ def test_does_not_take_off_with_an_empty_battery(emulate):
             tello.take_off()
 
 
-@pytest.mark.slow
-def test_a_drone_that_stops_answering_lands_itself_and_says_why(emulate):
-    emulator, address = emulate()
-    limits = TelloLimits(timeout_s=0.3, retries=1, keep_alive_s=0.5, state_loss_s=3.0)
-    with Tello(address, allow_motion=True, limits=limits) as tello:
-        tello.connect(PATIENCE_S)
-        tello.take_off()
-        emulator.link.cut = True
-        until(lambda: "no state" in tello.stop_reason)
-        emulator.link.cut = False  # it hears again: our landing is still being asked for
-        until(lambda: emulator.drone.mode is Mode.GROUND)
-
-
-@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (4, 5))])
-def test_bad_air_is_flown_through(emulate, seed):
+def test_bad_air_is_flown_through(emulate):
     """5 % loss and garbage on every port: safety-critical commands are repeated until acknowledged."""
-    emulator, address = emulate(link=LinkFaults(loss=0.05, garbage=0.2, video_latency_s=0.02), seed=seed)
+    emulator, address = emulate(link=LinkFaults(loss=0.05, garbage=0.2, video_latency_s=0.02), seed=3)
     limits = TelloLimits(timeout_s=0.5, retries=20, state_loss_s=PATIENCE_S, video_loss_s=PATIENCE_S)
     with Tello(address, allow_motion=True, limits=limits) as tello:
         tello.connect(PATIENCE_S)
@@ -467,29 +453,6 @@ def test_late_answers_and_noise_are_not_taken_for_an_answer():
     assert belongs_to("go 20 0 0 30", "error Not joystick")
     for command, text in [("battery?", "ok"), ("land", "87"), ("takeoff", "x"), ("sn?", "ok"), ("land", "ok\x00")]:
         assert not belongs_to(command, text)
-
-
-@pytest.mark.slow
-def test_an_outage_of_three_seconds_in_flight_is_survived(emulate):
-    emulator, address = emulate()
-    limits = TelloLimits(state_loss_s=PATIENCE_S, video_loss_s=PATIENCE_S)
-    with Tello(address, allow_motion=True, limits=limits) as tello:
-        tello.connect(PATIENCE_S)
-        video = tello.start_video()
-        video.wait(0, PATIENCE_S)
-        tello.take_off()
-        emulator.link.cut = True
-        begin = tello.clock.now()
-        until(lambda: tello.clock.now() - max(begin, tello.latest.stamp_s, video.newest.stamp_s) > 3.0)
-        gone, before = video.newest.count, tello.latest.stamp_s
-        emulator.link.cut = False
-        assert video.wait(gone + 3, PATIENCE_S) is not None
-        until(lambda: tello.latest.stamp_s > before)
-        assert emulator.drone.mode is Mode.FLYING
-        assert tello.stop_reason == ""
-        tello.move(0.3, 0.0, 0.0)
-        np.testing.assert_allclose(emulator.drone.p_w[:2], [0.3, 0.0], atol=0.12)
-    assert emulator.drone.mode is Mode.GROUND
 
 
 def test_no_answer_is_an_error_with_a_remedy():

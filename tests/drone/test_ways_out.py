@@ -69,7 +69,7 @@ def check_folder(folder):
     return len(frames)
 
 
-@pytest.mark.parametrize("number", POLITE)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_signal_lands_the_drone_and_leaves_a_whole_recording(tmp_path, number):
     with emulated() as (emulator, url), recording(url, tmp_path / "flight") as process:
         until(lambda: flying(emulator))

@@ -15,9 +15,7 @@ from emulated import PATIENCE_S, emulated, on_the_floor, until
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.drone.emulator.drone import Mode
-from edgeslam_torch.drone.emulator.encoder import Encoder
 from edgeslam_torch.drone.udp import open_udp
-from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.source import open_source
 
 pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
@@ -66,10 +64,10 @@ def record(url, folder, *options):
 @pytest.mark.alone
 def test_one_packet_in_twenty_lost(tmp_path, capsys):
     with emulated(loss=0.05) as (emulator, url):
-        assert record(url, tmp_path / "flight", "--max-frames", "150") == 0
+        assert record(url, tmp_path / "flight", "--max-frames", "60") == 0
         assert on_the_floor(emulator)
-    assert "150 frames" in capsys.readouterr().out
-    check_flight(tmp_path / "flight", tmp_path, 150)
+    assert "60 frames" in capsys.readouterr().out
+    check_flight(tmp_path / "flight", tmp_path, 60)
 
 
 @pytest.mark.slow
@@ -84,10 +82,10 @@ def test_an_outage_of_three_seconds(tmp_path, capsys):
             emulator.link.cut = False
 
         with meanwhile(cut):
-            assert record(url, tmp_path / "flight", "--max-frames", "200") == 0
+            assert record(url, tmp_path / "flight", "--max-frames", "150") == 0
         assert on_the_floor(emulator)
-    assert "200 frames" in capsys.readouterr().out
-    frames = check_flight(tmp_path / "flight", tmp_path, 200)
+    assert "150 frames" in capsys.readouterr().out
+    frames = check_flight(tmp_path / "flight", tmp_path, 150)
     gap = int(np.argmax(np.diff([f.stamp_s for f in frames])))
     assert frames[gap + 1].stamp_s - frames[gap].stamp_s > 2.0
     assert gap + 2 < len(frames)  # it went on
@@ -126,46 +124,7 @@ def test_garbage_on_every_port(tmp_path, capsys):
                         udp.sendto(rng.bytes(int(rng.integers(1, 1400))), ("127.0.0.1", port))
 
         with meanwhile(shout):
-            assert record(url, tmp_path / "flight", "--max-frames", "100") == 0
-        assert on_the_floor(emulator)
-    assert "100 frames" in capsys.readouterr().out
-    check_flight(tmp_path / "flight", tmp_path, 100)
-
-
-@pytest.mark.slow
-@pytest.mark.alone
-def test_packets_of_other_senders_change_nothing_and_are_reported(tmp_path, capsys):
-    """Video and a low-battery state from another address: the recording holds the drone's own images only."""
-    try:
-        other = open_udp(("127.0.0.2", 0), "stranger")
-    except SourceError:
-        pytest.skip("this system has one loopback address")
-    film = Encoder(64, 48, 30)
-    with other, emulated() as (emulator, url):
-        state, video = (("127.0.0.1", int(port)) for port in url.rsplit(":", 2)[1:])
-
-        def shout(stop):
-            while not stop.wait(0.01):
-                other.sendto(b"pitch:0;bat:1;h:0;tof:10;vgz:0;", state)
-                for packet in film.encode(np.zeros((48, 64, 3), np.uint8)):
-                    other.sendto(packet, video)
-
-        with meanwhile(shout):
             assert record(url, tmp_path / "flight", "--max-frames", "60") == 0
         assert on_the_floor(emulator)
-    said = capsys.readouterr()
-    assert re.search(r"warning: .* packets from others than the drone were refused \(video \d+, state \d+\)", said.out)
-    assert "video port: packets from 127.0.0.2 are refused; only 127.0.0.1 is listened to" in said.err
-    frames = check_flight(tmp_path / "flight", tmp_path, 60)
-    assert {f.image.shape for f in frames} == {(240, 320, 3)}
-    assert "bat:1;" not in (tmp_path / "flight" / "state.txt").read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.alone
-def test_a_drone_that_is_not_there(tmp_path, capsys):
-    with emulated() as (emulator, url):
-        emulator.frozen = True
-        assert main(["record", url, "--out", str(tmp_path / "flight"), "--fly"]) == 1
-    assert "is the drone on" in capsys.readouterr().err
-    assert not (tmp_path / "flight" / "rgb.txt").exists()
+    assert "60 frames" in capsys.readouterr().out
+    check_flight(tmp_path / "flight", tmp_path, 60)

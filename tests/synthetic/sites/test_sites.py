@@ -34,8 +34,8 @@ def test_start_and_goal_are_free_and_the_same_seed_gives_the_same_site(name, see
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", JUDGED)
-def test_twenty_seeds_of_a_judged_site_can_be_built(name):
-    for seed in range(20):
+def test_seeds_of_a_judged_site_can_be_built(name):
+    for seed in range(6):
         site = named_site(name, seed)
         assert site.clearance(site.goal_w[None])[0] > PASSAGE_M - 0.1
 
