@@ -1,5 +1,6 @@
 """Fixtures that every test folder shares."""
 
+import gc
 import os
 import signal
 import zlib
@@ -25,6 +26,13 @@ def pytest_configure(config: pytest.Config) -> None:
     for name in ("SIGTERM", "SIGHUP", "SIGQUIT"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_DFL)
+    gc.disable()  # loading torch and a thousand modules makes no garbage
+
+
+def pytest_collection_finish() -> None:
+    """What is loaded stays: the collector need not look at it again and again."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture
