@@ -39,10 +39,6 @@ def test_folder_that_holds_everything_is_left_out(put):
     assert put(tgz({"x/a": b"1", "x/b/c": b"2"})) == {"a": b"1", "b/c": b"2"}
 
 
-def test_without_such_a_folder_all_is_taken(put):
-    assert put(tgz({"rgb/0.png": b"1", "depth/0.png": b"2"})) == {"depth/0.png": b"2", "rgb/0.png": b"1"}
-
-
 def test_archive_in_an_archive_is_unpacked_and_the_others_are_not(put, tmp_path):
     inner = zipped({"seq-01/frame-0.png": b"1", "seq-01/Thumbs.db": b"junk"})
     outer = zipped({"kitchen/seq-01.zip": inner, "kitchen/seq-02.zip": b"x" * 10})

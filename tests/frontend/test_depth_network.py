@@ -66,13 +66,6 @@ def test_resolution_does_not_change_the_metres(weights: Path, image: np.ndarray)
     assert predictor(large, CAMERA.scaled(480, 360)).depth_m.mean() == pytest.approx(a, rel=0.05)
 
 
-def test_grey_image_equals_its_three_channel_copy(weights: Path, image: np.ndarray) -> None:
-    grey = np.ascontiguousarray(image[..., 0])
-    predictor = DepthPredictor(weights)
-    a, b = predictor(grey, CAMERA), predictor(np.repeat(grey[..., None], 3, 2), CAMERA)
-    np.testing.assert_array_equal(a.depth_m, b.depth_m)
-
-
 def test_preprocessing_is_whole_image_rgb_in_minus_one_to_one() -> None:
     image = np.zeros((64, 64, 3), np.uint8)
     image[:, :32, 0] = 255  # left half blue

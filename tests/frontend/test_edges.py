@@ -48,14 +48,6 @@ def test_colour_is_rgb_of_the_pixel():
     np.testing.assert_array_equal(edges.colour, image[v, u][:, ::-1])
 
 
-def test_grey_image_gives_the_same_edges_in_grey():
-    image = views()[0]
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    a, b = extract_edges(image, 40.0, 100.0, 500), extract_edges(grey, 40.0, 100.0, 500)
-    np.testing.assert_array_equal(a.uv, b.uv)
-    assert (b.colour == b.colour[:, :1]).all()
-
-
 def test_black_image_has_none():
     edges = extract_edges(np.zeros((60, 80, 3), np.uint8), 40.0, 100.0, 500)
     assert edges.uv.shape == (0, 2)

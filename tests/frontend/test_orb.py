@@ -47,13 +47,6 @@ def test_with_many_corners_faint_ones_change_nothing():
     np.testing.assert_array_equal(a.uv, b.uv)
 
 
-def test_same_image_gives_the_same_features():
-    grey = views()[0][..., 1].copy()
-    a, b = (OrbExtractor(OrbConfig(), CAMERA)(grey) for _ in range(2))
-    np.testing.assert_array_equal(a.uv, b.uv)
-    np.testing.assert_array_equal(a.descriptors, b.descriptors)
-
-
 def test_keypoints_come_undistorted(rng):
     grey = patchwork(rng, 768, 900)[:480, :640, 0].copy()
     camera = PRESETS["tum_fr1"]

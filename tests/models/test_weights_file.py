@@ -172,11 +172,6 @@ def test_absurd_values_are_refused(file: File, tmp_path: Path, factor: float) ->
     refused(file.write(tmp_path / "w.safetensors"), "conv3.0.weight reaches .*; no trained network")
 
 
-def test_a_double_beyond_single_precision_is_refused(file: File, tmp_path: Path) -> None:
-    file.replace("conv0.1.bias", "F64", [8], np.full(8, 1e300).tobytes())
-    refused(file.write(tmp_path / "w.safetensors"), "conv0.1.bias reaches 1.0e\\+300")
-
-
 def test_a_negative_variance_is_refused(file: File, tmp_path: Path) -> None:
     file.array("conv3.1.running_var")[0] = -1.0
     refused(file.write(tmp_path / "w.safetensors"), "conv3.1.running_var holds a negative variance")

@@ -91,11 +91,6 @@ def test_remarks_on_what_came_are_warnings_once():
     assert [w for w in source.warnings if "refused" in w] == ["webcam:0: 3 packets refused"]
 
 
-def test_number_of_frames_can_be_limited():
-    source = LiveSource("webcam:0", FakeFeed(range(1, 50)), [], None, 3, is_drone=False)
-    assert len(list(source.frames())) == 3
-
-
 def test_no_picture_is_an_error_and_gives_the_device_back():
     feed = FakeFeed([])
     with pytest.raises(SourceError, match="no picture"):

@@ -145,8 +145,3 @@ def test_unit_of_depth_in_the_words_of_orb_slam(tmp_path: Path, key: str) -> Non
     (folder / "camera.yaml").write_text("%YAML:1.0\n" + text)
     depth = load_depth_folder(folder).views[0].depth_m
     np.testing.assert_allclose(depth[20], np.linspace(1, 3, 64), atol=1e-3)
-
-
-def test_folder_has_its_name_from_within(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(write_folder(tmp_path / "kitchen", 2))
-    assert load_depth_folder(Path()).name == "kitchen"
