@@ -46,25 +46,25 @@ test-slow: $(STAMP)
 	$(PYTEST) -m "slow and not alone" $(PYTEST_ARGS) || test $$? = 5
 	$(PYTEST) -n 0 -m "slow and alone" $(PYTEST_ARGS) || test $$? = 5
 
-# mutmut changes the code in one place at a time and runs the tests that pass there: what none of them notices comes into
-# runs/mutation/survivors.txt. By default 100 changes of ten files, another ten each week, against the fast suite.
-#   make mutation MODULES='edgeslam_torch/geometry/*' TESTS=tests/geometry SAMPLE=300
-SEED ?= $(shell date +%G%V)
-SAMPLE ?= 100
+# mutmut changes the code in one place at a time and runs the tests that come by: what none of them notices is listed with
+# its change. By default every tenth change of ten files, against the fast suite; another tenth and other files each week.
+#   make mutation MODULES='edgeslam_torch/geometry/*' TESTS=tests/geometry WHICH='*'
+WEEK := $(shell date +%G%V)
+WHICH ?= *$(lastword $(shell echo $(WEEK) | grep -o .))
 TESTS ?= tests
-DRAW = shuf --random-source=<(yes $(SEED)) -n
-MODULES ?= $(shell find -L edgeslam_torch -name '*.py' -size +1k | sort | $(DRAW) 10)
-MUTMUT := OMP_NUM_THREADS=1 $(abspath $(BIN))/python -m mutmut
+MODULES ?= $(shell find -L edgeslam_torch -name '*.py' -size +1k | sort | shuf --random-source=<(yes $(WEEK)) -n 10)
+MUTMUT := $(abspath $(BIN))/python -m mutmut
+mutation: export OMP_NUM_THREADS := 1
 mutation: $(STAMP)
 	rm -rf runs/mutation && mkdir -p runs/mutation
 	cp -rL edgeslam_torch tests docs examples *.md *.txt CITATION.cff Makefile pyproject.toml runs/mutation
 	set -f; sed -i "s#^only_mutate = .*#only_mutate = [$$(printf '"%s",' $(MODULES))]#; \
 		s#^pytest_add_cli_args_test_selection = .*#pytest_add_cli_args_test_selection = [$$(printf '"%s",' $(TESTS))]#" \
 		runs/mutation/pyproject.toml
-	cd runs/mutation && $(MUTMUT) run 'none.*' > mutmut.log; true
-	cd runs/mutation && $(MUTMUT) results --all true | sed 's/^ *//; s/: .*//' | sort | $(DRAW) $(SAMPLE) | xargs $(MUTMUT) run > mutmut.log
-	cd runs/mutation && $(MUTMUT) results | sed -n 's/: \(survived\|no tests\)$$//p' | xargs -r -n 1 $(MUTMUT) show > survivors.txt
-	@tail -n 3 runs/mutation/mutmut.log; grep -c '^# ' runs/mutation/survivors.txt; echo "survivors: runs/mutation/survivors.txt"
+	cd runs/mutation && $(MUTMUT) run '*__mutmut_$(WHICH)' > mutmut.log
+	cd runs/mutation && $(MUTMUT) results | sed -n 's/^ *//; s/: \(survived\|no tests\)$$//p' | \
+		xargs -r -n 1 $(MUTMUT) show > survivors.txt
+	@tail -n 1 runs/mutation/mutmut.log; grep -c '^# ' runs/mutation/survivors.txt; echo "survivors: runs/mutation/survivors.txt"
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
