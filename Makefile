@@ -64,7 +64,7 @@ mutation: $(STAMP)
 	cd runs/mutation && $(MUTMUT) run '*__mutmut_$(WHICH)' > mutmut.log
 	cd runs/mutation && $(MUTMUT) results | sed -n 's/^ *//; s/: \(survived\|no tests\)$$//p' | \
 		xargs -r -n 1 $(MUTMUT) show > survivors.txt
-	@tail -n 1 runs/mutation/mutmut.log; grep -c '^# ' runs/mutation/survivors.txt; echo "survivors: runs/mutation/survivors.txt"
+	@echo "$$(grep -c "^# " runs/mutation/survivors.txt) survivors: runs/mutation/survivors.txt"
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -1,5 +1,6 @@
 """Batches drawn ahead by worker processes."""
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -14,6 +15,9 @@ T = TypeVar("T")
 
 AHEAD = 2
 """Batches that each worker prefetches."""
+
+HEARD_S = 1.0
+"""Time in which the system tells of a worker's death: torch's handler of that signal raises, here and not later."""
 
 
 class WorkerError(EdgeSlamError):
@@ -60,10 +64,14 @@ def _loader(draw: Callable[[int], T], steps: range, workers: int) -> DataLoader[
 
 
 def _unpacked(batches: Iterator[Any]) -> Iterator[Any]:
-    for found in batches:
-        if isinstance(found, Exception):
-            raise found
-        yield found
+    try:
+        for found in batches:
+            if isinstance(found, Exception):
+                raise found
+            yield found
+    except (ConnectionResetError, EOFError) as error:  # a worker died while it handed over a batch
+        time.sleep(HEARD_S)
+        raise RuntimeError(f"DataLoader worker is gone: {error}") from error
 
 
 def _started(loader: DataLoader[Any]) -> Iterator[Any]:

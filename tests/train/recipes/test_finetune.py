@@ -257,7 +257,6 @@ def test_out_that_cannot_be_written_is_one_line(finetune: Finetune, tmp_path: Pa
         (("--threads", "100000"), "--threads must be 1 to 256"),
         (("--validate", "kitchen"), "is used for training and cannot validate"),
         (("--max-frames", "0"), "--max-frames must be at least 1"),
-        (("--steps", "0"), "--steps must be at least 1"),
         (("gone",), "gone: no such recording"),
         (("--validate", "start.safetensors"), "no recording with depth"),
     ],
@@ -330,6 +329,10 @@ def test_signal_says_what_is_kept_and_the_same_command_goes_on(
     assert "goes on after step 5" in finetune("kitchen")[1]
     for name in ("weights.safetensors", "final.safetensors", "curve.jsonl"):
         assert (whole / name).read_bytes() == (resumed / name).read_bytes(), name
+
+
+def test_no_step_is_a_mistake(finetune: Finetune) -> None:
+    refused(finetune("kitchen", steps=0), "--steps must be at least 1")
 
 
 def test_hooks_of_the_command_line_take_part(finetune: Finetune, tmp_path: Path) -> None:
