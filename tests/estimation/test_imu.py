@@ -131,6 +131,30 @@ def test_readings_that_contradict_the_images_are_not_used(fault: str) -> None:
     assert len(found.warnings()) == 1
 
 
+@pytest.mark.parametrize("fault", ["g", "axes", "sign", "clipped"])
+def test_accelerations_that_contradict_the_images_are_not_used(fault: str) -> None:
+    model = mounted(ADIS16448, T_IMU_CAM)
+    for seed in range(3):
+        seen = flight("free", model, seed)
+        felt = seen.readings.acceleration_m_s2
+        faulty = {"g": felt / 9.81, "axes": felt[:, [1, 2, 0]], "sign": -felt, "clipped": np.clip(felt, -9.0, 9.0)}
+        seen.readings = ImuReadings(seen.readings.stamps_s, seen.readings.angular_rate_rad_s, faulty[fault])
+        found = fitted(seen, model)
+        assert found.scale is None and found.up is None
+        assert len(found.warnings()) == 1
+
+
+def test_a_gap_of_the_readings_costs_accuracy_only() -> None:
+    model = mounted(ADIS16448, T_IMU_CAM)
+    seen = flight("free", model, 0)
+    kept = np.abs(seen.readings.stamps_s - 6.0) > 0.4
+    there = seen.readings
+    seen.readings = ImuReadings(there.stamps_s[kept], there.angular_rate_rad_s[kept], there.acceleration_m_s2[kept])
+    found = fitted(seen, model).scale
+    assert found is not None
+    assert found.log_scale == pytest.approx(math.log(SCALE), abs=0.01)
+
+
 def test_rotation_between_frames() -> None:
     model = mounted(ADIS16448, T_IMU_CAM)
     seen = flight("free", model, 0)

@@ -37,12 +37,14 @@ LEAST_NODES = 12
 """Minimum number of nodes, 2.5 s: of fewer, the size of their errors is too uncertain."""
 _STEPS, _METRIC_STEPS = 12, 4
 """Iterations; the first ones linear in the scale itself, whose start is arbitrary."""
-_CONVERGED = 0.02
-"""Change of the log scale in sigmas at which the iteration ends."""
+_CONVERGED, _LARGEST_LOG = 0.05, 20.0
+"""Change of what is common to all nodes, in sigmas, at which the iteration ends; a log scale that has diverged."""
 _OUTLIER = 4.0
 """Error of one pose (6 numbers) from which on it counts linearly [standard deviations]: one in a hundred."""
 _BIAS_SIGMA = np.repeat([0.1, 0.3], 3)
 """Standard deviation of the biases at power-on [rad/s, m/s^2]: the larger one of cheap sensors, 30 mg."""
+_FAST_M_S = 1e3
+"""Standard deviation of a velocity that nothing else tells, inside a gap."""
 _FLOOR_RAD, _FLOOR_SHARE = 1e-4, 1e-4
 """Least standard deviation of visual rotations, and of positions as a share of the extent of the way."""
 _START_RAD, _START_SHARE = 3e-3, 0.02
@@ -83,6 +85,8 @@ class Alignment:
     """``(10, 10)`` of log scale, gravity's direction (2) [rad], mount (3) [rad], lever (3) [m], offset [s]."""
     sigma_pose: tuple[float, float]
     """Standard deviations of the errors of visual poses [rad, map units]."""
+    extent: float = 0.0
+    """Root mean square distance of the nodes from their mean [map units]."""
     excitation: float = 0.0
     """Root mean square of the changing acceleration between nodes, in standard deviations of the accelerometer's noise:
     near 1 nothing but noise has moved, and the covariance of the scale means nothing."""
@@ -141,11 +145,12 @@ def align(
     pre = preintegrate(readings.stamps_s, rates, readings.acceleration_m_s2, moments, bias, noise)
     R_m_c, z = T_m_c[:, :3, :3], T_m_c[:, :3, 3]
     extent = float(np.sqrt(np.mean(np.sum((z - z.mean(axis=0)) ** 2, axis=1))))
-    if not pre.complete.all() or extent <= 0.0:
+    if pre.complete.sum() < LEAST_NODES - 1 or extent <= 0.0:
         return None
     rate = np.stack([np.interp(moments, readings.stamps_s, rates[:, k]) for k in range(3)], axis=1)
     x = _initial(stamps_s, R_m_c, z, pre, (*mount, lever) if before is None else before, extent)
-    whiten = np.linalg.inv(np.linalg.cholesky(pre.covariance))
+    there = pre.complete[:, None, None]  # across a gap of the readings only images relate two nodes
+    whiten = there * np.linalg.inv(np.linalg.cholesky(np.where(there, pre.covariance, np.eye(9))))
     walk = np.repeat([model.gyroscope_random_walk, model.accelerometer_random_walk], 3)
     floor = _FLOOR_RAD, _FLOOR_SHARE * extent
     unknown = known is None
@@ -171,16 +176,14 @@ def align(
             return None
         x = _moved(x, by_node, by_all, metric)
         x = replace(x, covariance=covariance, sigma_pose=_error_sizes(x, R_m_c, z, pre.dt_s, floor, offset_s))
-        change = abs(by_all[_SCALE])
-        if not math.isfinite(change) or abs(x.log_scale) > 20.0:
+        if not (np.isfinite(by_all).all() and (np.diag(covariance) > 0.0).all()) or abs(x.log_scale) > _LARGEST_LOG:
             return None
-        if not (np.diag(covariance) > 0.0).all():
-            return None
-        if step > metric_steps and change < _CONVERGED * math.sqrt(covariance[_SCALE, _SCALE]):
+        if step > metric_steps and (np.abs(by_all) < _CONVERGED * np.sqrt(np.diag(covariance))).all():
             break
-    felt = np.diff(x.velocity, axis=0) / pre.dt_s[:, None]
-    noise_m_s2 = model.accelerometer_noise_density / np.sqrt(pre.dt_s)[:, None]
-    return replace(x, excitation=float(np.sqrt(np.mean(((felt - felt.mean(axis=0)) / noise_m_s2) ** 2))))
+    dt_s = pre.dt_s[pre.complete, None]
+    felt = np.diff(x.velocity, axis=0)[pre.complete] / dt_s
+    noise_m_s2 = model.accelerometer_noise_density / np.sqrt(dt_s)
+    return replace(x, extent=extent, excitation=float(np.sqrt(np.mean(((felt - felt.mean(axis=0)) / noise_m_s2) ** 2))))
 
 
 def _initial(
@@ -322,6 +325,7 @@ def _solved(
     slope[0] += g[:n]
     common = common + g[n:]
     six = np.arange(9, 15)
+    own[:, 6 + np.arange(3), 6 + np.arange(3)] += _FAST_M_S**-2
     own[0, six, six] += _BIAS_SIGMA**-2
     slope[0, 9:] += _BIAS_SIGMA**-2 * bias
     known = np.arange(3, _COMMON)

@@ -26,6 +26,8 @@ _REFIT_S, _REFIT_SHARE = 1.0, 0.12
 _CONTRADICTED_RAD = math.radians(3.0)
 """Size of the errors of visual rotations beyond which gyroscope and images do not move together; in flight they are
 0.1 to 0.3 degrees."""
+_CONTRADICTED_SHARE, _CONTRADICTED_M = 0.05, 0.03
+"""The same for visual positions, of the extent of the way and in metres; in flight 0.01 and 0.01 to 0.02 m."""
 _UPRIGHT_RAD = math.radians(1.0)
 """Maximum standard deviation of a vertical that levels the output."""
 _OFFSET_RANGE_S, _OFFSET_STEP_S = 0.5, 0.005
@@ -110,6 +112,8 @@ class Imu:
         if found is not None and found.sigma_pose[0] > _CONTRADICTED_RAD:
             check = checked_against_rotation(readings, self.model, stamps_s, T_m_c[:, :3, :3])
             found, self.fault = None, check.fault or "the IMU contradicts the images"
+        elif found is not None and found.excitation > _LEAST_EXCITATION and _misses(found):
+            found, self.fault = None, "accelerations contradict the images: unit, axes, or clipped at the range's end?"
         self.alignment = found
 
     def _aligned(
@@ -193,6 +197,12 @@ class Imu:
                 "imu visual error m": unit * found.sigma_pose[1],
             }
         return numbers
+
+
+def _misses(found: Alignment) -> bool:
+    """Whether the errors of visual positions are as large as only those of another motion."""
+    error = found.sigma_pose[1]
+    return error > _CONTRADICTED_SHARE * found.extent and error * math.exp(found.log_scale) > _CONTRADICTED_M
 
 
 def _spaced(stamps_s: FloatArray) -> list[int]:
