@@ -445,8 +445,8 @@ class EdgeSlam:
         return self._earlier.summary(self.support(), self.map)
 
     def telemetry_statistics(self) -> dict[str, float]:
-        """Telemetry statistics: counts, delay, tilt, scale by source; empty without telemetry."""
-        return self._system.fusion.statistics() if self._system.has_telemetry else {}
+        """Telemetry's and IMU's statistics: counts, delay, tilt, scale by source; empty without either."""
+        return self._system.fusion.statistics() if self._system.has_telemetry else self._system.fusion.imu.statistics()
 
     def losses(self) -> dict[str, float]:
         """The paper's losses of the final map by name, see `window_losses`; empty before `finish`."""

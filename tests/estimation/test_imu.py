@@ -101,8 +101,10 @@ def test_without_acceleration_there_is_no_scale(motion: str, kind: ImuModel) -> 
 def test_mount_and_clock_are_found(offset_s: float) -> None:
     for seed in range(3):
         seen = flight("free", mounted(ADIS16448, T_IMU_CAM, offset_s), seed)
-        found = fitted(seen, replace(ADIS16448, **UNKNOWN)).alignment
+        imu = fitted(seen, replace(ADIS16448, **UNKNOWN))
+        found = imu.alignment
         assert found is not None
+        assert imu.statistics()["imu time offset s"] == found.offset_s
         assert found.offset_s == pytest.approx(offset_s, abs=1e-3)
         off = Rotation.from_matrix(T_IMU_CAM[:3, :3].T @ found.R_i_c).magnitude()
         assert math.degrees(off) < 0.3

@@ -183,9 +183,12 @@ class Imu:
 
     def statistics(self) -> dict[str, float]:
         """The newest alignment, for the report."""
+        if not self._parts:
+            return {}
         numbers: dict[str, float] = {"imu readings": len(self)}
         if (found := self.alignment) is not None:
-            unit = math.exp(found.log_scale)
+            unit, mount = math.exp(found.log_scale), np.rad2deg(Rotation.from_matrix(found.R_i_c).as_rotvec())
+            numbers |= {f"imu mount {axis} deg": float(angle) for axis, angle in zip("xyz", mount, strict=True)}
             numbers |= {
                 "scale imu": unit,
                 "scale imu sigma": unit * found.sigma_log_scale,
