@@ -41,8 +41,6 @@ LOOP_VOTES = 20
 wallpaper 22."""
 WITHIN_PX = 5.0
 """Offset up to which tracking and the window find the old anchors without a loop (`mapping/local_loop_closure.py`)."""
-AGAIN_S = 0.1
-"""Time between two keyframes of a renewed search, which takes a third of a core."""
 SCALE_AGAIN_S = 2.0
 """Time between two comparisons of the scales of the camera's submap and the first one."""
 WITNESSES = 4
@@ -98,10 +96,6 @@ class Atlas:
         """Links that no other one has confirmed yet."""
         self._searched = -1
         """Newest keyframe that was searched."""
-        self._again: list[int] = []
-        """Keyframes to search once more, the next one last."""
-        self._again_s = -np.inf
-        """Stamp of the last renewed search."""
         self._loop_searched: Keyframe | None = None
         """Newest keyframe that was searched for a loop."""
         self._scale_s = -np.inf
@@ -118,38 +112,20 @@ class Atlas:
 
     @property
     def is_up_to_date(self) -> bool:
-        """Whether every keyframe was searched and none is waiting for a renewed search."""
-        return max(self.map.keyframes, default=-1) <= self._searched and not self._again
+        """Whether every keyframe was searched."""
+        return max(self.map.keyframes, default=-1) <= self._searched
 
-    def update(self, stamp_s: float = np.inf) -> MapChange | None:
-        """Search the keyframes that are new since the last call, and one of those that wait for a renewed search.
+    def update(self) -> MapChange | None:
+        """Search the keyframes that are new since the last call; returns the resulting merge or closed loop, if any.
 
         The caller must own the map.
-
-        Args:
-            stamp_s: Present time.
-
-        Returns:
-            The resulting merge or closed loop, if any.
         """
-        for id in [*sorted(id for id in self.map.keyframes if id > self._searched), *self._next_again(stamp_s)]:
-            self._searched = max(self._searched, id)
+        for id in sorted(id for id in self.map.keyframes if id > self._searched):
+            self._searched = id
             change = self._search(self.map.keyframes[id])
             if change is not None:
                 return change
         return None
-
-    def search_again(self) -> None:
-        """Search every keyframe once more in the next calls of `update`, newest first, after its submap has grown."""
-        self._again = sorted(self.map.keyframes)
-
-    def _next_again(self, stamp_s: float) -> list[int]:
-        """The next keyframe of the renewed search, if one is due."""
-        if not self._again or stamp_s - self._again_s < AGAIN_S:
-            return []
-        self._again_s = stamp_s
-        id = self._again.pop()
-        return [id] if id in self.map.keyframes else []
 
     def search_all_again(self) -> None:
         """Search every keyframe in the next `update`."""
@@ -316,7 +292,6 @@ class Atlas:
             similarity = dict.fromkeys(self._keyframes_of(moved), S)
         scale_change = self._moved(similarity)
         merge_submaps(self.map, self.tracker.camera, links, self.lm)
-        self._again = []
         scales = {piece: self.known_scale.pop(piece, None) for piece in (mine, theirs)}
         stayed = scales[mine if moved == theirs else theirs]
         if stayed is not None:

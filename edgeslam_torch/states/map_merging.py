@@ -20,8 +20,6 @@ class MapMerging:
         self.atlas = atlas
         self._piece: int | None = None
         """Submap whose scale is published."""
-        self._left: int | None = None
-        """Submap of the previous frame."""
 
     def update(self, stamp_s: float = math.inf) -> str:
         """Merge submaps and close loops that the newest keyframes connect; returns a description, empty without any.
@@ -33,11 +31,10 @@ class MapMerging:
         if system.mapping.busy or not system.log.records:
             return ""
         if len(system.map.begun) > 1:
-            self._notice_return()
             scale = system.fusion.scale()
             now = scale if system.published.is_wrong_by(scale) else None
             changes.append(self._followed(lambda: self.atlas.correct_scale(stamp_s, now)))
-        while not self.atlas.is_up_to_date and (found := self._followed(lambda: self.atlas.update(stamp_s))):
+        while not self.atlas.is_up_to_date and (found := self._followed(self.atlas.update)):
             changes.append(found)
         return "; ".join(str(change) for change in changes if change is not None)
 
@@ -61,14 +58,6 @@ class MapMerging:
         if self.atlas.is_divided:
             self.atlas.search_all_again()
         self.update()
-
-    def _notice_return(self) -> None:
-        """When the camera returns to an earlier submap, the one that it left is complete: compare both again."""
-        piece = self.system.graph.present
-        returned = self._left is not None and piece < self._left
-        self._left = piece
-        if returned and self.atlas.is_divided:
-            self.atlas.search_again()
 
     def _followed(self, change_map: Callable[[], MapChange | None]) -> MapChange | None:
         """Change the map, and transform the current pose and the metric scale with it."""

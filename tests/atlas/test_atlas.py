@@ -104,29 +104,13 @@ def test_only_new_keyframes_are_compared_again_with_a_submap(rng):
     assert len(atlas.changes) == 1
 
 
-def test_keyframes_are_compared_again_one_at_a_time_newest_first(rng, monkeypatch):
-    """Not all at once, which would stop the video for a second."""
-    pieces = Pieces(rng)
-    atlas, asked = pieces.atlas(), []
-    monkeypatch.setattr(atlas, "_search", lambda keyframe: asked.append(keyframe.id))
-    atlas.update(0.0)
-    assert (asked, atlas.is_up_to_date) == ([0, 1, 2, 3, 4, 5, 6, 7], True)
-    asked.clear()
-    atlas.search_again()
-    told = [(atlas.update(1.0 + 0.04 * i), len(asked))[1] for i in range(8)]
-    assert (asked, told) == ([7, 6, 5], [1, 1, 1, 2, 2, 2, 3, 3])
-    assert not atlas.is_up_to_date
-
-
 def test_a_missed_link_is_found_by_a_later_comparison(rng):
     pieces = Pieces(rng)
     atlas = pieces.atlas()
     atlas._searched = 7  # as if each had been asked before the other piece had grown
-    assert atlas.update(0.0) is None
-    atlas.search_again()
-    joins = [join for i in range(8) if (join := atlas.update(1.0 + i)) is not None]
-    assert len(joins) == 1
-    assert atlas.is_up_to_date
+    assert atlas.update() is None
+    atlas.search_all_again()
+    assert atlas.update() is not None
 
 
 def test_submaps_of_different_places_are_not_merged(rng):

@@ -23,7 +23,6 @@ class Pieces:
         self.T_k_w, self.piece = T_k_w, 1
         self.begun = {0: "first", 1: "second"}
         self.queries = 0
-        self.again = []
 
     @property
     def present(self):
@@ -36,7 +35,7 @@ class Pieces:
     def atlas(self, moved):
         """Finds one merge that moves submap number ``moved``."""
 
-        def update(stamp_s):
+        def update():
             self.queries += 1
             if self.piece == 0:
                 return None
@@ -48,7 +47,6 @@ class Pieces:
         return SimpleNamespace(
             update=update,
             search_all_again=lambda: None,
-            search_again=lambda: self.again.append(self.piece),
             correct_scale=lambda stamp_s, now: None,
             is_up_to_date=False,
             is_divided=True,
@@ -186,16 +184,3 @@ def test_the_axes_of_an_earlier_flight_apply_in_its_map(rng, turned):
     np.testing.assert_array_equal(system.published.R, np.eye(3))
     assert system.published.revision == 2 * int(turned)
     assert system.published.turned_upright(R_w_m, np.zeros(3)) is system.published
-
-
-def test_submaps_are_compared_again_when_the_camera_returns_to_an_earlier_one(rng):
-    """The one that it left is complete; one that has just begun is not."""
-    T_k_w, motion = moving(rng)
-    system = system_of(Pieces(T_k_w), motion)
-    atlas = system.map.atlas(moved=1)
-    atlas.is_up_to_date = True
-    joining = MapMerging(system, atlas)
-    for piece, queries in ((0, 0), (1, 0), (1, 0), (0, 1), (0, 1), (1, 1), (0, 2)):
-        system.map.piece = piece
-        joining.update()
-        assert len(system.map.again) == queries
