@@ -1,8 +1,4 @@
-"""The gate: whether a measurement agrees with what is believed.
-
-The squared Mahalanobis distance of a residual is compared with chi-square at a confidence. Components of infinite
-variance are unknown: they add neither distance nor degrees of freedom.
-"""
+"""The gate: whether a measurement agrees with what is believed, by chi-square of its squared Mahalanobis distance."""
 
 import numpy as np
 from scipy.special import chdtri
@@ -14,7 +10,7 @@ CONFIDENCE = 0.99
 
 
 def passes(residual: FloatArray, covariance: FloatArray, confidence: float = CONFIDENCE) -> bool:
-    """Whether a residual ``(N,)`` is within its covariance ``(N, N)`` at a confidence.
+    """Whether a residual ``(N,)`` is within its covariance ``(N, N)``; components of infinite variance are left out.
 
     Example:
         >>> passes(np.array([2.0, 0.5]), np.eye(2)), passes(np.array([2.0, 3.0]), np.eye(2))

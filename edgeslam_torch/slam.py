@@ -44,7 +44,6 @@ from edgeslam_torch.mapping.level.gravity import best_known, up_by_gravity
 from edgeslam_torch.mapping.level.straight_edges import up_by_edges
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.mapping.pipeline import MappingPipeline
-from edgeslam_torch.states.lost import Lost
 from edgeslam_torch.states.machine import Machine, State
 from edgeslam_torch.states.map_merging import MapMerging
 from edgeslam_torch.states.starting import FIRST_FRAME, Starting
@@ -158,7 +157,6 @@ class EdgeSlam:
         self._earlier = PriorMaps()
         self._tracking = Tracking(self._system)
         self._starting = Starting(self._system, self._tracking, atlas, lm, realtime)
-        self._lost = Lost(self._system, self._tracking, self._starting)
         cv2.setRNGSeed(config.seed)
 
     def __repr__(self) -> str:
@@ -287,9 +285,13 @@ class EdgeSlam:
             return self._starting.begin(frame, seen.view, FIRST_FRAME)
         if self.state is State.STARTING:
             return self._starting.step(frame, seen)
-        if self.state is State.LOST:
-            return self._lost.step(frame, seen, self._machine)
-        return self._tracking.step(frame, seen) or self._lost.begin(frame, seen.view)
+        machine, lost = self._machine, self.state is State.LOST
+        T_predicted = self._system.predict(frame.stamp_s, lost)
+        if lost:
+            step = self._tracking.search(frame, seen, T_predicted, machine.lost_frames)
+        else:
+            step = self._tracking.step(frame, seen, T_predicted)
+        return step or self._starting.miss(frame, seen.view, T_predicted, machine.lost_since_s)
 
     def health(self) -> Health | None:
         """Reliability of the newest pose and its metres; ``None`` before the first frame. Callable from any thread."""

@@ -20,8 +20,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.geometry.rotations import rpy_from_matrix
 from edgeslam_torch.slam import EdgeSlam
-from edgeslam_torch.states.lost import UNCONFIRMED
-from edgeslam_torch.states.starting import AFTER_LOSS
+from edgeslam_torch.states.starting import AFTER_LOSS, UNCONFIRMED
 from edgeslam_torch.tracking.tracker import Tracker
 from edgeslam_torch.types import DepthMap, Frame, FrameStatus, TelemetrySample, Units
 

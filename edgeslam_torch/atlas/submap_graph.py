@@ -172,11 +172,11 @@ class SubmapGraph:
             other: Likewise.
             depth: Median depth of what is seen [map units].
         """
-        pieces = [self.map.piece_of(k.id) for k in (one, other)]
-        one_map = pieces[0] == pieces[1]
+        mine, theirs = (self.map.piece_of(k.id) for k in (one, other))
+        one_map = mine == theirs
         if not one_map and BEFORE_S in (one.stamp_s, other.stamp_s):
             return None
-        sigma_t, sigma_r = self.apart(*pieces, one.centre_w)
+        sigma_t, sigma_r = self.apart(mine, theirs, one.centre_w)
         if not math.isfinite(sigma_t):
             return None
         drift, steps = self._drift(one, other)

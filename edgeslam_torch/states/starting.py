@@ -1,4 +1,7 @@
-"""Start of a submap: predicted depths at its first keyframe, until two views or a changed view establish the map."""
+"""Start of a submap: predicted depths at its first keyframe, until two views or a changed view establish the map.
+
+A submap starts with the flight, and at the predicted pose after a while without one.
+"""
 
 from dataclasses import replace
 
@@ -9,6 +12,7 @@ from edgeslam_torch.atlas.atlas import MAX_CANDIDATES, Atlas
 from edgeslam_torch.atlas.place_recognition import revisit_candidates
 from edgeslam_torch.frontend.aperture import are_corners
 from edgeslam_torch.frontend.image import as_grey, colours_at
+from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.depth_prior import sample
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.optim.problem import LmConfig
@@ -30,6 +34,9 @@ since parallax may never come (rotation, climb, hover); two views are not tried 
 points that are left. A lower share lets two views come first more often, which is better where corners are many and
 wrong on bare boards, where a few random samples decide."""
 
+LOST_BEFORE_RESTART_S = 0.65
+"""Time without a pose after which a new submap is started at the predicted one."""
+
 MIN_INLIERS = 15
 """Minimum number of inliers; fewer could agree with a wrong pose."""
 
@@ -45,6 +52,9 @@ AFTER_LOSS = "new piece of map after loss: pose predicted, depth guessed"
 
 NOWHERE = Reach(np.eye(4), -np.inf, -np.inf)
 """For a camera that may be in another submap: no position is expected, so that several frames must agree."""
+
+UNCONFIRMED = "looks like a known place, the next frames must agree"
+"""Reason given for an unconfirmed relocalisation."""
 
 DEPTH_MAP = "map from the depth network, no parallax yet"
 
@@ -108,6 +118,24 @@ class Starting:
         system.begin_submap(keyframe)
         slam_map.remove_empty_keyframes()
         return Step(Event.BEGUN, keyframe, FrameStatus.STARTING, reason, is_keyframe=True)
+
+    def miss(self, frame: Frame, view: View, T_predicted: FloatArray, lost_since_s: float) -> Step:
+        """A frame without a pose: predict it, or start a new submap there after a longer loss."""
+        system = self.system
+        system.events["lost"] += lost_since_s == np.inf
+        self.tracking.lost.append((frame.index, view))
+        system.motion.drift(T_predicted)
+        system.fusion.add_visual(frame.stamp_s, se3.inverse(T_predicted), np.inf, np.inf, tracked=False)
+        seen = len(view.features.uv)
+        # Without a map to return to, as after dark first images, the conditions of a first map apply.
+        enough = 2 * MIN_KEYPOINTS if len(system.map.anchors) > 0 else MIN_KEYPOINTS
+        waiting = self.tracking.relocaliser.waiting > 0
+        if frame.stamp_s - lost_since_s >= LOST_BEFORE_RESTART_S and seen >= enough and not waiting:
+            system.events["restarted"] += 1
+            system.motion.stop()
+            return self.begin(frame, view, AFTER_LOSS)
+        reason = f"only {seen} keypoints" if seen < MIN_KEYPOINTS else "too few keypoints agree with the map"
+        return Step(Event.NOTHING, system.map.latest(), FrameStatus.PREDICTED, UNCONFIRMED if waiting else reason)
 
     def step(self, frame: Frame, seen: LazyView) -> Step:
         """Track the predicted depths and try to replace them by a better map."""

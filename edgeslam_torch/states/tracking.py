@@ -67,11 +67,9 @@ class Tracking:
         self._template = None
         self.relocaliser.forget()
 
-    def step(self, frame: Frame, seen: LazyView) -> Step | None:
+    def step(self, frame: Frame, seen: LazyView, T_predicted: FloatArray) -> Step | None:
         """Track the frame near its prediction; None if that fails."""
-        system = self.system
-        T_predicted = system.predict(frame.stamp_s, lost=False)
-        with system.map.lock:
+        with self.system.map.lock:
             located = self._locate(frame, seen, T_predicted)
             if located is not None:
                 located = self._check_with_sensors(frame, seen, T_predicted, located)
