@@ -338,11 +338,11 @@ def _solved(
     coupling = (_T(J[:, :, n : 2 * n]) @ J[:, :, :n])[:, i, j]
     band[(n + i - j)[None], n * np.arange(N - 1)[:, None] + j] = coupling
     factor = cholesky_banded(band, lower=True, check_finite=True)
-    border = border.reshape(-1, _COMMON)
-    solved = cho_solve_banded((factor, True), np.column_stack([border, slope.ravel()]))
-    covariance = np.linalg.inv(corner - border.T @ solved[:, :-1])
+    across = border.reshape(-1, _COMMON)
+    solved = cho_solve_banded((factor, True), np.column_stack([across, slope.ravel()]))
+    covariance = np.linalg.inv(corner - across.T @ solved[:, :-1])
     covariance = 0.5 * (covariance + covariance.T)
-    by_all = -covariance @ (common - border.T @ solved[:, -1])
+    by_all = -covariance @ (common - across.T @ solved[:, -1])
     return -(solved[:, -1] + solved[:, :-1] @ by_all).reshape(N, n), by_all, covariance
 
 
