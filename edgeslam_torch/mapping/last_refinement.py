@@ -27,10 +27,12 @@ EFFECTIVE_SAMPLES = 2.4
 """Errors of neighbouring pixels on an edge are correlated: about six count as one (the root of six)."""
 ITERATIONS = 30
 COST_TOLERANCE = 1e-5
+POSE_TOLERANCE = 0.5
+"""Distance to the minimum [standard deviations of independent errors, all poses together]: errors of keypoints are
+correlated, so that the true standard deviation is several times larger."""
 MU = 1e-8
-"""Initial damping. Every refinement converges fully: scale drift, or rotation explained as translation, is a slow mode,
-which a solver that stops at a percent of the cost, or is damped by the stiff modes, never corrects
-(docs/decisions/12-solver.md)."""
+"""Initial damping: scale drift, or rotation explained as translation, is a slow mode, which a solver damped by the
+stiff modes never corrects (docs/decisions/12-solver.md)."""
 
 
 def lm_config(config: WindowConfig) -> LmConfig:
@@ -41,6 +43,7 @@ def lm_config(config: WindowConfig) -> LmConfig:
         max_iterations=0 if config.reprojection == "off" else ITERATIONS,
         mu=MU,
         cost_tolerance=COST_TOLERANCE,
+        pose_tolerance=POSE_TOLERANCE,
         kernel=Kernel.L2 if config.reprojection == "literal" else Kernel.HUBER,
     )
 

@@ -7,6 +7,8 @@ from typing import Generic, Protocol, TypeVar
 from edgeslam_torch.optim.problem import LmConfig, StopReason
 
 _MU_MIN = 1e-12
+_MU_FREE = 1e-6
+"""Damping up to which a short step of the poses means that they are at the minimum: more may hold them."""
 
 S = TypeVar("S")
 
@@ -21,6 +23,8 @@ class Step(Generic[S]):
     """Decrease of the cost predicted by the linear model."""
     size: float
     """Largest component of the step."""
+    sigmas: float = math.inf
+    """Length of the poses' part in standard deviations; infinite without free poses."""
 
 
 class Linearised(Protocol):
@@ -82,6 +86,7 @@ def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[L
     if system.gradient < config.gradient_tolerance:
         return ended(StopReason.GRADIENT_CONVERGED)
     solved = False
+    lengths: list[float] = []
     while tried < config.max_iterations:
         tried += 1
         step = problem.propose(system, mu)
@@ -93,6 +98,8 @@ def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[L
             decrease = system.cost - trial.cost
             if math.isfinite(trial.cost) and decrease >= 0.0 and step.predicted > 0.0:
                 small = decrease <= config.cost_tolerance * system.cost
+                lengths = [step.sigmas, *lengths[:2]]
+                still = mu <= _MU_FREE and _remaining(lengths) < config.pose_tolerance
                 ratio = decrease / step.predicted
                 system = trial
                 accepted += 1
@@ -100,6 +107,8 @@ def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[L
                 nu = 2.0
                 if small:
                     return ended(StopReason.COST_CONVERGED)
+                if still:
+                    return ended(StopReason.STEP_CONVERGED)
                 if not math.isfinite(system.gradient):
                     return ended(StopReason.NOT_FINITE)
                 if system.gradient < config.gradient_tolerance:
@@ -112,3 +121,12 @@ def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[L
         if mu > config.mu_max:
             return ended(StopReason.STALLED if solved else StopReason.SINGULAR)
     return ended(StopReason.MAX_ITERATIONS)
+
+
+def _remaining(lengths: list[float]) -> float:
+    """Distance to the minimum that is expected after steps of these lengths, the last one first.
+
+    Robust weights make the convergence linear, and slow where depths are uncertain: a short step alone says little.
+    """
+    rate = max((lengths[0] / lengths[k]) ** (1.0 / k) for k in range(1, len(lengths))) if len(lengths) > 1 else 0.5
+    return lengths[0] * max(1.0, rate / (1.0 - rate)) if rate < 1.0 else math.inf

@@ -235,6 +235,8 @@ class LmConfig:
     mu_max: float = 1e8
     cost_tolerance: float = 1e-5
     """Relative decrease of the cost below which an accepted step is the last."""
+    pose_tolerance: float = 0.0
+    """Expected distance of the poses to the minimum [standard deviations, all poses together] that ends the search."""
     step_tolerance: float = 1e-9
     """Largest tangent component below which a step is the last."""
     gradient_tolerance: float = 1e-9

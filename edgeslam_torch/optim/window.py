@@ -1,5 +1,6 @@
 """A window as a least-squares problem: cost, normal equations and steps of its poses, anchors, edges and junctions."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,13 +83,14 @@ class Window:
         S, right, factors = self._reduce(system, mu)
         diagonal = system.H.diagonal()
         S[np.diag_indices_from(S)] += mu * diagonal + _FLOOR
-        delta = np.zeros(len(right))
+        delta, sigmas = np.zeros(len(right)), math.inf
         if len(delta):
             # LAPACK is column-major: numpy's upper triangle is its lower one.
             L, failed = lapack.dpotrf(S.T, lower=1, overwrite_a=1)
             if failed:
                 return None
             delta = -lapack.dpotrs(L, right, lower=1)[0]
+            sigmas = math.sqrt(max(0.0, -float(delta @ right)))
         predicted = _promise(mu, diagonal, system.g, delta)
         size = _largest(delta)
         poses = delta.reshape(-1, 6)
@@ -101,7 +103,7 @@ class Window:
         T = system.state.T_c_w.copy()
         for i, xi in zip(self.free, poses, strict=True):
             T[i] = se3.exp(xi) @ T[i]
-        return Step(State(T, tuple(x)), predicted, size)
+        return Step(State(T, tuple(x)), predicted, size, sigmas)
 
     def refine(self) -> WindowResult:
         """Run the solver and collect the result."""

@@ -118,3 +118,31 @@ def test_starts_at_the_minimum():
 def test_config_rejects_invalid_values(wrong):
     with pytest.raises(ValueError, match="must"):
         LmConfig(**wrong)
+
+
+@dataclass
+class Distance:
+    """One variable in standard deviations from the minimum, which every step shortens by the same rate."""
+
+    rate: float
+
+    def linearise(self, state: float) -> Linear:
+        return Linear(np.array([state]), np.eye(1), np.array([state]), state**2)
+
+    def propose(self, system: Linear, mu: float) -> Step[float]:
+        x = float(system.x[0])
+        return Step(self.rate * x, (1.0 - self.rate**2) * x**2, abs(x), sigmas=(1.0 - self.rate) * x)
+
+
+@pytest.mark.parametrize("rate", [0.1, 0.5, 0.9, 0.97])
+def test_ends_within_the_tolerance_of_the_minimum_however_slow_the_steps(rate):
+    config = LmConfig(mu=1e-9, max_iterations=500, cost_tolerance=0.0, pose_tolerance=0.5)
+    end, summary = minimise(Distance(rate), 20.0, config)
+    assert summary.stop is StopReason.STEP_CONVERGED
+    assert 0.0 < end.x[0] <= 0.5
+    assert end.x[0] / rate**2 > 0.4  # and not much later than that
+
+
+def test_short_steps_under_damping_do_not_end_the_search():
+    config = LmConfig(mu=1.0, max_iterations=5, cost_tolerance=0.0, pose_tolerance=1e9)
+    assert minimise(Distance(0.9), 20.0, config)[1].iterations > 1

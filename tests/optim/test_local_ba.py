@@ -1,5 +1,6 @@
 """Window refinement on clean, contaminated and degenerate synthetic worlds."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -277,6 +278,18 @@ def test_depth_priors_set_the_scale(rng):
     assert len(result.chi2) == len(window.problem.uv)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_search_ended_by_the_poses_is_at_the_minimum_within_the_tolerance(seed):
+    """The distance of the costs is the squared distance of the states in standard deviations."""
+    problem = points_only(seeded_window(seed, SMALL)).problem
+    tight = refine_window(problem, TIGHT)
+    early = refine_window(problem, replace(TIGHT, mu=1e-8, pose_tolerance=1.0))
+    assert early.stop is StopReason.STEP_CONVERGED
+    assert early.iterations < tight.iterations
+    fixed = replace(problem, T_c_w=early.T_c_w, p_w=early.p_w, pose_fixed=np.ones(len(problem.T_c_w), bool))
+    assert refine_window(fixed, TIGHT).cost_after - tight.cost_after < 1.0
+
+
 # -- degenerate windows ---------------------------------------------------------------------------------------
 
 
@@ -430,3 +443,21 @@ def test_gtsam_finds_the_same_minimum():
     result = refine_window(problem, TIGHT)
     assert result.cost_after == pytest.approx(cost, rel=1e-8)
     np.testing.assert_allclose(result.T_c_w, T_c_w, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "size", [WindowSize(fixed=2), WindowSize(25, 15, 2000, 12_800), WindowSize(60, 2, 4000, 25_000)]
+)
+def test_a_step_takes_at_most_a_quarter_of_gtsams_time(size):
+    pytest.importorskip("gtsam", reason="gtsam is an outside oracle and not installed")
+    problem, steps = points_only(seeded_window(0, size)).problem, 4
+    config = LmConfig(max_iterations=steps, cost_tolerance=0.0, diagnostics=False)
+    refine_window(problem, config)  # compiles
+    ours, theirs = [], []
+    for _ in range(3):
+        start = time.process_time()
+        assert refine_window(problem, config).iterations == steps
+        ours.append(time.process_time() - start)
+        theirs.append(refine_with_gtsam(problem, steps)[0])
+    assert min(ours) <= 0.25 * min(theirs)
