@@ -38,8 +38,6 @@ from edgeslam_torch.estimation.snapshot import Present, Snapshot
 from edgeslam_torch.estimation.telemetry.comparison import Comparison, FlightSoFar
 from edgeslam_torch.estimation.telemetry.delay import DelaySearch
 from edgeslam_torch.estimation.telemetry.local_scale import drift_in_words, scale_around, scale_of
-from edgeslam_torch.estimation.telemetry.scale_change import REACH_S, grown
-from edgeslam_torch.estimation.telemetry.scale_convergence import ScaleConvergence
 from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, SensorGate
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory, VisualPose
@@ -88,11 +86,10 @@ class MotionFusion:
         self.imu = Imu(ImuModel() if imu is None else imu)
         self._comparison = Comparison(config)
         self._filter = FilterFeed(config, given)
-        self._convergence = ScaleConvergence()
         self._drift: str | None = None
         """Warning that parts of the map have different scales."""
-        self._fitted_s = self._followed_s = -math.inf
-        """Stamps of the last fit, and of the last adaptation to the map between fits."""
+        self._fitted_s = -math.inf
+        """Stamp of the last fit."""
         self._counts: Counter[str] = Counter()
 
     # --- input ---------------------------------------------------------------------------------------------------
@@ -133,8 +130,6 @@ class MotionFusion:
         if self._is_due(stamp_s) or (stamp_s - self._fitted_s >= _FIRST_FIT_S and self.orientation.has_diverged()):
             self._remember_refined(stamp_s, self.config.window_s)
             self._refit()
-        elif self.metres.sensor_scale is not None and stamp_s - max(self._fitted_s, self._followed_s) >= _REFIT_S:
-            self._follow_map(stamp_s)
         if self.imu.is_due(stamp_s):
             self._remember_refined(stamp_s, IMU_REACH_S)
             self._fit_imu()
@@ -142,13 +137,6 @@ class MotionFusion:
             self._filter.see(visual, Metric(self.scale(), self.flight.delay.delay))
         else:
             self._filter.clear()
-
-    def _follow_map(self, stamp_s: float) -> None:
-        """Adapt the scale to a map that refinement has scaled since the last fit."""
-        self._followed_s = stamp_s
-        before = self._memory.displacements()
-        self._remember_refined(stamp_s, REACH_S)
-        self.metres.follow(math.log(grown(before, self._memory.displacements(), stamp_s)))
 
     def add_earlier(self, stamps_s: FloatArray, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
         """Add the frames on which a new submap rests, from before its first tracked one.
@@ -182,12 +170,10 @@ class MotionFusion:
         self.metres.inertial = self.imu.scale
 
     def _remember_refined(self, stamp_s: float, reach_s: float) -> None:
-        """Update the poses of the last seconds to the present map, and measure the change."""
+        """Update the poses of the last seconds to the present map."""
         if self.refined_poses is None:
             return
-        before = self._memory.sightings()
         self._remember(*self.refined_poses(stamp_s - reach_s))
-        self._convergence.compare(before, self._memory.sightings(), stamp_s)
 
     def _remember(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
         self._memory.revise(stamps_s, T_w_c)
@@ -440,18 +426,15 @@ class MotionFusion:
         present = FlightSoFar(self._memory, self._track, turned.R_b_c, metres.rough(), network, wander_log)
         self._comparison.judge(self._trust, present, self.flight.delay.delay, turned.R_w_m, flying)
         self._trust.at_odds = None
-        convergence_sigma = self._convergence.sigma if flying else 0.0
         previous_scale = metres.previous_scale()
 
         def scale(trust: SensorGate) -> TelemetryScale:
             T_b_c = orientation.T_b_c
             return TelemetryScale(self.config, T_b_c, present, trust, self.delay_s, turned, previous_scale, flying)
 
-        metres.take(scale(self._trust).opinion(), convergence_sigma, self._trust)
+        metres.take(scale(self._trust).opinion(), self._trust)
         guesses = flying and metres.sensor_scale is None
-        metres.provisional_scale(
-            scale(self._trust.supposing_heights()).opinion() if guesses else None, convergence_sigma
-        )
+        metres.provisional_scale(scale(self._trust.supposing_heights()).opinion() if guesses else None)
         oldest = self._memory.sightings().stamps_s[0]
         self._drift = drift_in_words(self.scale_around, float(oldest), last.stamp_s)
 

@@ -72,28 +72,26 @@ class ScaleEstimator:
         else:
             self._remembered = LogScale(math.log(scale.value), scale.sigma / scale.value, "atlas")
 
-    def take(self, found: Found | None, convergence_sigma: float, trust: SensorGate) -> None:
+    def take(self, found: Found | None, trust: SensorGate) -> None:
         """Update with telemetry.
 
         Args:
             found: Its scale.
-            convergence_sigma: Relative error due to later changes of the map.
             trust: Usable readings; a scale that rests on others is dropped.
         """
         if found is not None:
             self.fit = found[1]
         if found is not None and found[0].sigma < _BELIEVED:
-            self.sensor_scale = replace(found[0], sigma=math.hypot(found[0].sigma, convergence_sigma))
+            self.sensor_scale = found[0]
         elif not self._still_trusted(trust) or self._of_heights():
             self.sensor_scale, self.fit = None, TelemetryFit(shortfall_m_s=self.fit.shortfall_m_s)
         # else no new information: hover, pure rotation, or no telemetry
 
-    def provisional_scale(self, found: Found | None, convergence_sigma: float) -> None:
-        """Update the guess with heights that are not validated yet; arguments as in `take`."""
+    def provisional_scale(self, found: Found | None) -> None:
+        """Update the guess with heights that are not validated yet."""
         self.guess = None
-        if found is not None and (sigma := math.hypot(found[0].sigma, convergence_sigma)) < _BELIEVED:
-            value = math.exp(found[0].log_scale)
-            self.guess = ScaleEstimate(value, value * sigma, found[0].source)
+        if found is not None and found[0].sigma < _BELIEVED:
+            self.guess = _estimate(found[0])
 
     def follow(self, log_ratio: float) -> None:
         """Adapt the scale to a map that has grown by ``exp(log_ratio)``."""

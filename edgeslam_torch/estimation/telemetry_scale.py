@@ -20,7 +20,6 @@ from edgeslam_torch.estimation.scale.joint_scale import (
     turned_since,
 )
 from edgeslam_torch.estimation.scale.log_scale import LogScale, floor_segments
-from edgeslam_torch.estimation.scale.windowed_scale import PRESENT_S, Parted, has_changed, present_scale
 from edgeslam_torch.estimation.telemetry.comparison import FlightSoFar
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
     LEAST_COUNT,
@@ -80,10 +79,6 @@ class SourceScale:
     value: float
     """Metres per map unit."""
     sigma: float
-
-
-_FADING = 0.1
-"""Log scale uncertainty that is added to a changed map's scale until the next fit, seconds later."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,15 +146,6 @@ class _Shown:
     def ends_s(self) -> FloatArray:
         """Starts and ends ``(2 N,)`` of the intervals."""
         return np.concatenate([self.intervals.from_s, self.intervals.to_s])
-
-
-def _shared_drift(given: list[_Given]) -> float:
-    """Correlated error of velocities and heights in their mean: both inherit the drift of the map."""
-    if len(given) < 2:
-        return 0.0
-    weight = np.array([g.sigma for g in given]) ** -2.0
-    one, other = weight / weight.sum() * [g.evidence.drift_sigma for g in given]
-    return math.sqrt(2.0 * one * other)
 
 
 def _by_steps(z_m: FloatArray, step_m: float) -> float:
@@ -239,34 +225,7 @@ class TelemetryScale:
         variance = sum(p * (o.sigma**2 + (o.log_scale - mean) ** 2) for p, o in mixed)
         truncates = dict(zip(found, share.tolist(), strict=True)).get(Rounding.TRUNCATE, 0.0)
         fit = replace(best.fit, truncates=truncates)
-        return self._unless_parted(LogScale(mean, math.sqrt(variance), "+".join(fit.sources)), fit)
-
-    def _unless_parted(self, before: LogScale, fit: TelemetryFit) -> tuple[LogScale, TelemetryFit]:
-        """The scale of the whole flight, or that of the last seconds if both contradict each other."""
-        now = (self._at_present() or self._lately()) if self._flying else None
-        if now is None or not at_odds(now, before):
-            self._trust.parted = None
-            return before, fit
-        self._trust.parted = Parted(now, before)
-        scale = math.exp(now.log_scale)
-        return now, replace(fit, moved=None, sources={"telemetry": SourceScale(scale, scale * now.sigma)})
-
-    def _lately(self) -> LogScale | None:
-        """The previous present scale, with a sigma that grows until new motion is measured."""
-        last = self._trust.parted
-        return None if last is None else replace(last.now, sigma=math.hypot(last.now.sigma, _FADING))
-
-    def _at_present(self) -> LogScale | None:
-        """Scale from the displacements of the last seconds, if telemetry is validated."""
-        last = self._present.memory.last
-        shown = self._compared(by_told=True) if self._trust.proven and last is not None else None
-        if shown is None or last is None:
-            return None
-        moved, step = shown.intervals, self._config.velocity_step_m_s
-        late = moved.to_s > last.stamp_s - self._delay_s - PRESENT_S
-        seen = moved.moved @ self._R_w_m.T
-        now = present_scale(seen[late], shown.told[late], moved.duration_s[late], step)
-        return now if now is not None and has_changed(now, seen[~late], shown.told[~late]) else None
+        return LogScale(mean, math.sqrt(variance), "+".join(fit.sources)), fit
 
     def _together(self, rounding: Rounding, moved: Evidence | None, systematic: float) -> _Hypothesis | None:
         tilt = self._tilt_rad
@@ -295,7 +254,7 @@ class TelemetryScale:
                 parted_log = abs(one.log_scale - other.log_scale)
         sources = {g.name: SourceScale(g.scale, g.scale * g.sigma) for g in given}
         # Birge ratio: disagreement beyond the sigmas widens the result.
-        sigma = max(parted_log, max(1.0, gap) * math.hypot(together[1], _shared_drift(given)))
+        sigma = max(parted_log, max(1.0, gap) * together[1])
         log_odds = (0.0 if moved is None else moved.log_likelihood) - 0.5 * min(gap, CONTRADICTION) ** 2
         moved = moved if "telemetry" in sources else None
         shortfall_m_s = 0.5 * self._config.velocity_step_m_s if rounding is Rounding.TRUNCATE else 0.0
@@ -370,18 +329,7 @@ class TelemetryScale:
             if abs(change) < _SETTLED:
                 break
             scale *= 1.0 + float(np.clip(change, -_MOST_CHANGE, _MOST_CHANGE))
-        # A wandering scale absorbs truncation errors too, so rounding modes are compared with a constant scale.
-        rigid = self._evidence(intervals, whole, None) if self._flying else evidence
-        if rigid is None:
-            return None
-        return replace(self._with_drift(softened, rigid), log_likelihood=rigid.log_likelihood)
-
-    def _with_drift(self, evidence: Evidence, rigid: Evidence) -> Evidence:
-        """Evidence of the present scale, with the uncertainty that drift adds to a constant scale."""
-        pair = [solved([e], self._tilt_rad) for e in (evidence, rigid)]
-        if pair[0] is None or pair[1] is None:
-            return evidence
-        return replace(evidence, drift_sigma=math.sqrt(max(0.0, pair[0][1] ** 2 - pair[1][1] ** 2)))
+        return softened
 
     def _evidence(self, moved: Displacements, moved_m: FloatArray, aged: FloatArray | None) -> Evidence | None:
         config = self._config
@@ -404,8 +352,8 @@ class TelemetryScale:
             return None
         return aged_since(stamps_s + self._delay_s, memory.began_s, memory.last.stamp_s)
 
-    def _compared(self, by_told: bool = False) -> _Shown | None:
-        """Intervals in which the drone moves; ``by_told`` selects them by telemetry instead of vision."""
+    def _compared(self) -> _Shown | None:
+        """Intervals in which the drone moves."""
         track, config, memory = self._present.track, self._config, self._present.memory
         moved = memory.displacements()
         if len(moved) == 0:
@@ -417,7 +365,7 @@ class TelemetryScale:
         R_from, R_to = track.attitude(moved.from_s), track.attitude(moved.to_s)
         told = track.displacement(np.concatenate([moved.from_s, moved.to_s]))
         moved_m = told[len(moved) :] - told[: len(moved)] + (R_to - R_from) @ self._T_b_c[:3, 3]
-        moving = self._moving(moved, moved_m, by_told)
+        moving = self._moving(moved, moved_m)
         if moving.sum() < 2:
             return None
         moved, moved_m = moved.only(moving), moved_m[moving]
@@ -428,9 +376,9 @@ class TelemetryScale:
         velocity = seen_velocity(track, seen, self._delay_s, self._R_w_m, self._T_b_c, config.max_gap_s)
         return _Shown(moved, moved_m, velocity, math.sqrt(ways[0] / ways[1]))
 
-    def _moving(self, moved: Displacements, moved_m: FloatArray, by_told: bool) -> np.ndarray:
+    def _moving(self, moved: Displacements, moved_m: FloatArray) -> np.ndarray:
         """Mask of intervals above the minimum speed, measured by vision once the scale is roughly known."""
-        if self._held is not None and not by_told:
+        if self._held is not None:
             speed = np.linalg.norm(moved.moved, axis=1) * self._held / moved.duration_s
         else:
             speed = np.linalg.norm(moved_m, axis=1) / moved.duration_s
@@ -472,9 +420,6 @@ class TelemetryScale:
                 evidence = evidence.softened(scale * _by_steps(z[here], _HEIGHT_STEP_M[name]))
             single = solved([evidence], tilt) if evidence is not None else None
             if evidence is not None and single is not None and single[1] < best_sigma:
-                if aged is not None:
-                    rigid = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt)
-                    evidence = evidence if rigid is None else self._with_drift(evidence, rigid)
                 best, best_sigma = evidence, single[1]
             if best_sigma < _GOOD_HEIGHT:
                 break

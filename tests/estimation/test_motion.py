@@ -417,8 +417,8 @@ def test_small_height_changes_give_no_scale(swinging, replay):
 def test_unconfirmed_scale_from_heights_is_withdrawn(source, held, found):
     trusting = SimpleNamespace(velocity=True, tells_scale=True, height=lambda reading: True, at_odds=None)
     metres = ScaleEstimator(FusionConfig(), 0.0)
-    metres.take((LogScale(0.0, 0.1, source), TelemetryFit()), 0.0, trusting)
-    metres.take(found, 0.0, trusting)
+    metres.take((LogScale(0.0, 0.1, source), TelemetryFit()), trusting)
+    metres.take(found, trusting)
     assert (metres.sensor_scale is not None) == held
 
 

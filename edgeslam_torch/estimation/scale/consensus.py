@@ -14,7 +14,7 @@ from edgeslam_torch.estimation.scale.log_scale import LogScale
 CONTRADICTION = 3.0
 """Maximum difference of consistent estimates [sigmas], exceeded by chance in 0.3 % of the cases."""
 _AT_ODDS = 5.0
-AT_ODDS_LOG = math.log(1.5)
+_AT_ODDS_LOG = math.log(1.5)
 """Difference in sigmas and factor beyond which one of two estimates is a gross error."""
 _WRONG_UNIT_LOG = 0.5 * math.log(10.0)
 """Half a decade: beyond it a wrong unit of velocity (a power of ten) is the most likely cause of a contradiction."""
@@ -27,7 +27,7 @@ def contradict(a: LogScale, b: LogScale) -> bool:
 
 def at_odds(a: LogScale, b: LogScale) -> bool:
     """Whether one of two estimates must be a gross error, not merely overconfident."""
-    return _apart(a, b) > max(AT_ODDS_LOG, _AT_ODDS * math.hypot(a.sigma, b.sigma))
+    return _apart(a, b) > max(_AT_ODDS_LOG, _AT_ODDS * math.hypot(a.sigma, b.sigma))
 
 
 def _apart(a: LogScale, b: LogScale) -> float:

@@ -28,8 +28,6 @@ _MIN_EXPLAINED = 0.5
 """Minimum share of the visual path explained by the fit."""
 MIN_DISPLACEMENTS = 6
 _MIN_HEIGHTS = 4
-_MOST_PARTS = 4
-"""Maximum number of parts of a flight whose scales are compared; shorter parts are too noisy."""
 _BELIEF = 20.0
 """Weight of the expected noise against the observed one, in residuals."""
 _USUAL_BIAS_M_S = 0.01
@@ -72,8 +70,6 @@ class Evidence:
     """Of the displacements, up to a constant, for comparing models of the same data."""
     wander: float = USUAL_WANDER
     """Standard deviation of the map's scale change; estimated by displacements only."""
-    drift_sigma: float = 0.0
-    """Relative error of the present scale due to that change, common to velocities and heights."""
     torn: bool = False
     """Whether no single scale fits most of the visual path."""
 
@@ -178,8 +174,7 @@ def displacement_evidence(
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(3.0 * float(weight.sum()), 1e-9))
     bias_m_s = fit.bias[:, -1] / duration_s[-1]
     torn = float(weight @ np.sum(moved_map**2, axis=1)) < _MIN_EXPLAINED * length
-    evidence = Evidence(fit.information, fit.vector, rms, bias_m_s, fit.log_likelihood, wander, torn=torn)
-    return evidence.softened(_unrest(sigma_m**2 + (s * sigma_map) ** 2, fit, J, latent, target))
+    return Evidence(fit.information, fit.vector, rms, bias_m_s, fit.log_likelihood, wander, torn=torn)
 
 
 def height_evidence(
@@ -261,36 +256,6 @@ def height_evidence(
     vector = v[_THETA] - A[_THETA, _OFFSETS] @ inner @ v[_OFFSETS]
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(float(weight.sum()), 1e-9))
     return Evidence(0.5 * (information + information.T), vector, rms, np.zeros(3))
-
-
-def _unrest(white: FloatArray, fit: "_Fit", J: FloatArray, latent: FloatArray, target: FloatArray) -> float:
-    """Error of the mean scale [m per map unit] due to differences between parts of the flight beyond their noise.
-
-    Scale drift of the map, or telemetry that is right only in part, does not show in the residuals within a part.
-    Outliers of the fit are included: they may be a part of the map with another scale. The variance between parts is
-    that of a random-effects model (DerSimonian and Laird 1986).
-    """
-    n = len(white)
-    parts = min(_MOST_PARTS, n // MIN_DISPLACEMENTS)
-    if parts < 2:
-        return 0.0
-    C = fit.noise.covariance.copy()
-    C.flat[:: n + 1] += white
-    scale, information = np.zeros(parts), np.zeros(parts)
-    for k, i in enumerate(np.array_split(np.arange(n), parts)):
-        inverse = np.linalg.inv(C[np.ix_(i, i)])
-        A = np.einsum("anu,anv->uv", latent[:, i], inverse @ J[:, i])[_SCALE]
-        v = float(np.einsum("an,anx->", latent[:, i, _SCALE], inverse @ target[:, i]))
-        information[k] = max(float(A[_SCALE]), 0.0)
-        scale[k] = (v - float(A[1:] @ fit.theta[1:])) / max(float(A[_SCALE]), 1e-30)
-    information /= fit.kappa
-    total, squares = float(information.sum()), float(np.sum(information**2))
-    room = total - squares / max(total, 1e-30)
-    if not room > 0:
-        return 0.0
-    apart = float(np.sum(information * (scale - np.sum(information * scale) / total) ** 2))
-    between = max(0.0, (apart - (parts - 1)) / room)
-    return math.sqrt(between * squares) / total
 
 
 def aged_since(stamps_s: FloatArray, began_s: float, now_s: float) -> FloatArray:

@@ -13,7 +13,6 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.estimation.scale.windowed_scale import Parted
 from edgeslam_torch.estimation.telemetry.track import Turn
 from edgeslam_torch.geometry.robust_statistics import median
 from edgeslam_torch.types import FloatArray, IntArray
@@ -229,8 +228,6 @@ class SensorGate:
         """Best-fitting video delay if it is outside the allowed range."""
         self.at_odds: AtOdds | None = None
         """Contradictory scales of velocities and height, if any."""
-        self.parted: Parted | None = None
-        """Set while the scale of the last seconds contradicts that of the flight before."""
         self.tells_scale = True
         """Whether velocities could be fitted to the displacements."""
         self.reread: Reread | None = None
@@ -271,12 +268,6 @@ class SensorGate:
     def turns(self) -> bool:
         """Whether attitude may constrain rotations: only after validation."""
         return self.elsewhere_s is None and self.verdict(Reading.ATTITUDE) is Verdict.AGREES
-
-    @property
-    def proven(self) -> bool:
-        """Whether a reading is validated and none contradicted."""
-        readings = (Reading.VELOCITY, Reading.ATTITUDE, *HEIGHTS)
-        return self.motion and any(self.verdict(r) is Verdict.AGREES for r in readings)
 
     def height(self, reading: Reading) -> bool:
         """Whether a height is usable: it needs the vertical, and its own validation if no other reading is
@@ -327,8 +318,6 @@ class SensorGate:
                 said.append(f"telemetry's height ({reading}) is not used: {_why(height, 'climbing and sinking')}")
         if self.at_odds is not None:
             said.append(self.at_odds.warning())
-        if self.parted is not None:
-            said.append(self.parted.warning())
         return said
 
 
