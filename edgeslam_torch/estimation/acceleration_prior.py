@@ -6,11 +6,9 @@ position metres away a tenth of a second earlier.
 
 import numpy as np
 
+from edgeslam_torch.noise import IMPLAUSIBLE_ACCELERATION_M_S2
 from edgeslam_torch.types import FloatArray
 
-ACCELERATION_M_S2 = 10.0
-"""Standard deviation of the acceleration along each axis, 1 g: weak against images; hands and drones have 0.2 to
-1.7."""
 LONGEST_S = 0.5
 """Maximum time between two frames; over longer gaps the camera may have stopped and restarted."""
 
@@ -42,6 +40,6 @@ def inertia(stamps_s: FloatArray, metres: float) -> FloatArray | None:
     change[rows, first] = 1.0 / before
     change[rows, first + 1] = -1.0 / before - 1.0 / after
     change[rows, first + 2] = 1.0 / after
-    sigma = ACCELERATION_M_S2 / metres * 0.5 * (before + after)
+    sigma = IMPLAUSIBLE_ACCELERATION_M_S2 / metres * 0.5 * (before + after)
     whitened = change / sigma[:, None]
     return np.asarray(np.kron(whitened.T @ whitened, np.eye(3)))

@@ -5,32 +5,19 @@ from dataclasses import dataclass
 from typing import Literal
 
 _POSITIVE = (
-    "sigma_velocity_m_s",
-    "sigma_attitude_rad",
     "velocity_step_m_s",
     "buffer_s",
     "interval_s",
     "window_s",
-    "sigma_tof_m",
-    "sigma_h_m",
-    "sigma_baro_m",
-    "depth_bias_log",
     "max_gap_s",
     "alignment_sigma_rad",
 )
 _NOT_NEGATIVE = (
     "beta",
     "lambda_tau",
-    "floor_position_m",
     "sigma_bias_m_s",
-    "bias_walk_m_s_sqrt_s",
-    "initial_sigma_position_m",
     "initial_sigma_angle_rad",
-    "sigma_turn_rad_sqrt_s",
     "literal_beta",
-    "systematic_log",
-    "height_systematic_log",
-    "truncation_systematic_log",
     "min_speed_m_s",
 )
 
@@ -53,20 +40,8 @@ class FusionConfig:
     """Growth of the process noise with the time since the last visual update [1/s], paper eq. (10)."""
     literal_beta: float = 1e-3
     """The paper's beta, which there has the units of the whole covariance (m^2 and rad^2)."""
-    sigma_velocity_m_s: float = 0.033
-    """Standard deviation of one velocity reading: 0.1 / sqrt(12) of quantisation and 0.02 of sensor noise."""
-    sigma_attitude_rad: float = math.radians(0.36)
-    """Standard deviation of one attitude reading: 1 deg / sqrt(12) of quantisation, which repeats in hover."""
-    sigma_turn_rad_sqrt_s: float = 0.05
-    """Random walk of the angles between readings; set so that rotation errors match their covariance."""
     sigma_bias_m_s: float = 0.03
     """Initial velocity bias (0 removes the bias from the state: the paper's six states)."""
-    bias_walk_m_s_sqrt_s: float = 0.015
-    """Random walk of the velocity bias, before the battery factor."""
-    floor_position_m: float = 1e-3
-    """Minimum process noise [m/sqrt(s)], which keeps the covariance positive definite."""
-    initial_sigma_position_m: float = 0.0
-    """Standard deviation of the first position; 0, since it is the origin of the filter's world."""
     initial_sigma_angle_rad: float = math.radians(1.0)
     """Standard deviation of the first attitude, per axis; attitude is read in whole degrees."""
     gate_probability: float = 0.95
@@ -89,20 +64,6 @@ class FusionConfig:
     """Standard deviation of the camera's mount, per axis, until it is estimated from rotations."""
     min_speed_m_s: float = 0.06
     """RMS metric speed below which an interval does not constrain the scale (hover, rotation in place)."""
-    systematic_log: float = 0.008
-    """Systematic scale error of the drone's velocity, which averaging does not reduce."""
-    height_systematic_log: float = 0.02
-    """The same for heights over a climb of decimetres, along which the map bends by a centimetre."""
-    truncation_systematic_log: float = 0.015
-    """The same when readings are truncated: the mean remainder depends on an assumed noise."""
-    sigma_tof_m: float = 0.015
-    """Standard deviation of a reading of the range sensor (SDK ``tof``)."""
-    sigma_h_m: float = 0.06
-    """Standard deviation of the SDK's ``h``, which moves in steps of 10 cm."""
-    sigma_baro_m: float = 0.15
-    """Standard deviation of a reading of the barometer."""
-    depth_bias_log: float = 0.1
-    """Scale error of the depth network common to all keyframes of a scene; the estimated part is added to it."""
 
     def __post_init__(self) -> None:
         for name in _POSITIVE:

@@ -11,14 +11,13 @@ import numpy as np
 
 from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.estimation.telemetry.visual_memory import Sightings
+from edgeslam_torch.noise import HEIGHT_M, STAMP_S
 from edgeslam_torch.types import FloatArray
 
 REACH_S = 5.0
 """Time over which heights are compared with the map."""
 _CARRIED_S = 1.0
 """Time over which velocities are integrated; quantisation of 0.1 m/s adds up to as many metres per second."""
-_STAMPED_S = 0.05
-"""Standard deviation of a message's stamp: half the message interval."""
 _NOISE_M = 0.05
 """Three standard deviations of a range reading, and of a tracked position."""
 _STEP_M, _STEP_M_S = 0.08, 1.0
@@ -48,7 +47,7 @@ def reckoned(model: TelemetryModel, recent: Sightings, stamp_s: float) -> Reckon
         recent: Tracked poses of the last `REACH_S`, at least one.
         stamp_s: Stamp of the frame.
     """
-    late_s = math.hypot(model.delay_sigma_s, _STAMPED_S)
+    late_s = math.hypot(model.delay_sigma_s, STAMP_S)
     frame_s = stamp_s - model.delay_s + np.array([0.0, -late_s, late_s])
     stamps_s = recent.stamps_s - model.delay_s
     late = stamps_s >= stamps_s.max() - _CARRIED_S
@@ -90,7 +89,7 @@ def _by_height(
         return None
     then, now = np.interp(stamps_s[use], times_s, z), np.interp(frame_s, times_s, z)
     level = float(now[0] - np.median(then - seen[use]))
-    noise_m = max(_NOISE_M, 3.0 * getattr(model.config, f"sigma_{model.height}_m"))
+    noise_m = max(_NOISE_M, 3.0 * HEIGHT_M[model.height])
     return level, float(noise_m + _unsure(now, np.abs(now[0] - np.median(then)), model.scale_sigma_log))
 
 

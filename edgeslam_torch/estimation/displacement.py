@@ -25,29 +25,26 @@ from edgeslam_torch.estimation.scale.log_scale import floor_segments
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry.robust_statistics import tukey_weight
 from edgeslam_torch.geometry.se3 import hat
+from edgeslam_torch.noise import (
+    DELAY_S,
+    HEIGHT_M,
+    HEIGHT_MEMORY_S,
+    TILT_RAD,
+    UP_MEMORY_S,
+    UP_RAD,
+    VELOCITY_BIAS_M_S,
+    VELOCITY_BIAS_MEMORY_S,
+    VELOCITY_SENSOR_M_S,
+)
 from edgeslam_torch.types import FloatArray, IntArray
 
-BIAS_M_S = 0.015
-"""Standard deviation of the velocity bias (`joint_scale`)."""
-BIAS_MEMORY_S = 12.0
 _LASTING, _VARIES_S = 0.25, 1.0
 """Share of a quantisation error's variance that is constant while the reading is, and correlation time of the rest [s].
 Over a reading of three seconds the mean error is .01 m/s at varying speed; for a constant speed it would be .029."""
-SENSOR_M_S = 0.02
-"""Noise of one velocity reading before quantisation."""
-HEIGHT_MEMORY_S = 3.0
-"""Correlation time of errors of SDK height and barometer."""
-TILT_RAD = math.radians(2.0)
-"""Error of the rotation from map to world, mostly of the camera's mount."""
 LONGEST_S = 10.0
 """Maximum time between two positions for integrated velocity."""
-DELAY_S = 0.3
-"""Standard deviation of an unknown delay [s]."""
 FLOOR_M = 30.0
 """Uninformative prior on the floor's level."""
-UP_RAD = math.radians(2.0)
-"""Error of the direction of gravity in one frame: mount, acceleration."""
-UP_MEMORY_S = 5.0
 _UNPROVEN_S = 3.0
 """Range of delays to consider before telemetry is validated, as in `comparison`."""
 _STEADY_RAD = math.radians(15.0)
@@ -218,7 +215,8 @@ class TelemetryModel:
         R_w = self.track.axes()[heard]
         raw = np.einsum("swa,sw->sa", R_w, measured.velocity[heard])
         U = _runs(share, measured.stamp_s[heard], raw, R_w, step, truncates)
-        bias = BIAS_M_S**2 * np.exp(-np.abs(start[:, None] - start[None]) / BIAS_MEMORY_S) * np.outer(L, L)
+        memory = np.exp(-np.abs(start[:, None] - start[None]) / VELOCITY_BIAS_MEMORY_S)
+        bias = VELOCITY_BIAS_M_S**2 * memory * np.outer(L, L)
         slow = U @ U.T + np.einsum("ij,ab->iajb", bias, np.eye(3)).reshape(3 * N, 3 * N)
         half = 0.5 * step * math.sqrt(truncates * (1.0 - truncates))
         speed = self.track.displacement(at_s + 0.05) - self.track.displacement(at_s - 0.05)
@@ -232,7 +230,7 @@ class TelemetryModel:
             ],
             axis=-1,
         )
-        white = np.repeat(SENSOR_M_S**2 * 0.1 * L, 3)
+        white = np.repeat(VELOCITY_SENSOR_M_S**2 * 0.1 * L, 3)
         group = np.repeat(np.arange(N), 3)
         return _Rows(
             D.reshape(3 * N, K, 3),
@@ -250,7 +248,7 @@ class TelemetryModel:
         stamp, z = self.track.heights().get(name or "", (np.zeros(0), np.zeros(0)))
         if len(stamp) < 2:
             return None
-        sigma = float(getattr(self.config, f"sigma_{name}_m"))
+        sigma = HEIGHT_M[name]
         own = self.track.displacement(stamp)[:, 2]
         segment = floor_segments(stamp, z, own, step_m=max(0.08, 4.0 * sigma))
         after = np.clip(np.searchsorted(stamp, at_s), 1, len(stamp) - 1)

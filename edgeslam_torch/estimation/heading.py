@@ -5,20 +5,14 @@ quantisation to whole degrees; a drift rate, constant over the flight; scale fac
 video's delay times the yaw rate; and the offset between the map's axes and those of power-on.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.estimation.displacement import DELAY_S, TelemetryModel
+from edgeslam_torch.estimation.displacement import TelemetryModel
+from edgeslam_torch.noise import DELAY_S, HEADING_DRIFT_RAD_S, HEADING_RAD, TURN_SHARE
 from edgeslam_torch.types import FloatArray, IntArray
 
-HEADING_RAD = math.radians(0.5)
-"""Standard deviation of one heading: quantisation to whole degrees, and the error of the camera mount in a turn."""
-DRIFT_RAD_S = math.radians(0.02)
-"""Standard deviation of the gyroscope's drift rate: a degree per minute."""
-TURN_SHARE = 0.005
-"""Relative standard deviation of a rotation: scale factor of the gyroscope, error of the focal length."""
 _OFFSET_RAD = 1.0
 _RATE_S = 0.1
 """Time over which the yaw rate is computed."""
@@ -57,4 +51,4 @@ def _common(model: TelemetryModel, t: FloatArray) -> tuple[FloatArray, ...]:
     turned = model.track.yaw(np.stack([t - 0.5 * _RATE_S, t, t + 0.5 * _RATE_S]))
     yaw, rate = turned[1], (turned[2] - turned[0]) / _RATE_S
     late_s = min(model.delay_sigma_s, DELAY_S)
-    return np.full(len(t), _OFFSET_RAD), DRIFT_RAD_S * (t - t[0]), TURN_SHARE * (yaw - yaw[0]), late_s * rate
+    return np.full(len(t), _OFFSET_RAD), HEADING_DRIFT_RAD_S * (t - t[0]), TURN_SHARE * (yaw - yaw[0]), late_s * rate

@@ -43,6 +43,7 @@ from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory, VisualPose
 from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
 from edgeslam_torch.imu import ImuModel, ImuReadings
+from edgeslam_torch.noise import VISUAL_SIGMA
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
 
 _REFIT_S = 1.0
@@ -50,8 +51,6 @@ _FIRST_FIT_S = 0.5
 """Time between fits as long as telemetry has given no scale or no delay: the length of a displacement."""
 _REFIT_SHARE = 0.12
 """Time between fits as a share of the duration so far: later fits cost more and change less."""
-_USUAL_SIGMA = 0.01
-"""Standard deviation assumed for a visual pose from the log [map units, rad]."""
 
 
 class MotionFusion:
@@ -221,7 +220,7 @@ class MotionFusion:
         length_s = float(stamps_s[-1] - stamps_s[0]) + self.config.window_s
         memory = VisualMemory(self.config.interval_s, length_s, self.config.max_gap_s)
         for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
-            memory.add(VisualPose(stamp_s, T, _USUAL_SIGMA, _USUAL_SIGMA))
+            memory.add(VisualPose(stamp_s, T, VISUAL_SIGMA, VISUAL_SIGMA))
         low, T_b_c = self.metres.fit.shortfall_m_s, self.orientation.T_b_c
         return scale_of(memory.displacements(), self._track, self.delay_s, R_w_m, T_b_c, self.config, low)
 
@@ -332,10 +331,9 @@ class MotionFusion:
         return visual if propagated is None else between(visual, propagated, share)
 
     def _propagation(self) -> TelemetryPropagation:
-        sigma = self.config.sigma_velocity_m_s
         T_b_c, R_w_m = self.orientation.T_b_c, self.orientation.R_w_m
         delay_s, doubt_s = self.delay_s, self.flight.delay_sigma_s
-        return TelemetryPropagation(self._track, delay_s, doubt_s, T_b_c, R_w_m, self.scale(), self.metres.fit, sigma)
+        return TelemetryPropagation(self._track, delay_s, doubt_s, T_b_c, R_w_m, self.scale(), self.metres.fit)
 
     def statistics(self) -> dict[str, float]:
         """Counters and the state of the estimates, for the report."""
@@ -422,8 +420,7 @@ class MotionFusion:
         if turned is None:
             return
         orientation.found = turned
-        network, wander_log = metres.network(), metres.network_wander_log()
-        present = FlightSoFar(self._memory, self._track, turned.R_b_c, metres.rough(), network, wander_log)
+        present = FlightSoFar(self._memory, self._track, turned.R_b_c, metres.rough(), metres.network())
         self._comparison.judge(self._trust, present, self.flight.delay.delay, turned.R_w_m, flying)
         self._trust.at_odds = None
         previous_scale = metres.previous_scale()

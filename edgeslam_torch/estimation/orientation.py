@@ -4,20 +4,19 @@ import math
 
 import numpy as np
 
-from edgeslam_torch.estimation.displacement import DELAY_S, is_steady
+from edgeslam_torch.estimation.displacement import is_steady
 from edgeslam_torch.estimation.remembered import Remembered
 from edgeslam_torch.estimation.scale.camera_mount import Turned, mount_by_turns
 from edgeslam_torch.estimation.telemetry.alignment import LATELY, attitudes, map_to_world
 from edgeslam_torch.estimation.telemetry.comparison import MOST_APART_RAD
 from edgeslam_torch.geometry.rotations import rotation_vector
+from edgeslam_torch.noise import DELAY_S, STAMP_S
 from edgeslam_torch.types import FloatArray
 
 _TURNED_S = 5.0
 """Time over which map and attitude are aligned; maps drift by a degree in it."""
 _AT_ONCE_S = 0.5
 """Time after the first frame in which the first attitude must arrive to level the map: five messages."""
-_STAMPED_S = 0.05
-"""Standard deviation of a message's stamp: half the message interval."""
 
 
 class Orientation:
@@ -98,7 +97,7 @@ class Orientation:
         seconds, and its maximum error [rad] due to the uncertain delay; None without validated telemetry or enough
         frames."""
         flight = self._flight
-        late_s = math.hypot(flight.delay_sigma_s, _STAMPED_S)
+        late_s = math.hypot(flight.delay_sigma_s, STAMP_S)
         around = stamp_s - flight.delay_s + np.array([0.0, -late_s, late_s])
         if not (flight.trust.turns and math.isfinite(late_s) and flight.track.covered(around[:1], around[:1])[0]):
             return None

@@ -10,22 +10,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgeslam_torch.estimation.displacement import DELAY_S
 from edgeslam_torch.estimation.filter.filter_feed import FilterView
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualPose
 from edgeslam_torch.estimation.telemetry_scale import TelemetryFit
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.rotations import rotation_vector
+from edgeslam_torch.noise import ACCELERATION_M_S2, ANGULAR_ACCELERATION_RAD_S2, DELAY_S, VELOCITY_M_S
 from edgeslam_torch.types import FloatArray, ScaleEstimate
 
 VISUAL_REACH_S = 0.15
 """Time up to which the last visual velocity predicts better than 10 Hz readings of 0.1 m/s."""
 _VISUAL_LIMIT_S = 0.5
 """Time after which constant velocity stops, without telemetry."""
-_ACCELERATION_M_S2 = 1.0
-_ANGULAR_ACCELERATION_RAD_S2 = 1.0
-"""Standard deviations for a hand or a small drone: constant velocity is off by 20 mm and 20 mrad after 0.2 s."""
 _PACKET_S = 0.15
 """Maximum extrapolation of telemetry, which is ahead of a late video: one packet."""
 
@@ -65,8 +62,8 @@ def with_velocity(
     seen = by_vision(last, previous, prior.stamp_s)
     gap, before = prior.stamp_s - last.stamp_s, last.stamp_s - previous.stamp_s
     grown = math.sqrt(1.0 + 2.0 * (gap / before) ** 2)  # jitter of two poses in their difference
-    sigma_t = math.hypot(0.5 * _ACCELERATION_M_S2 * gap**2 / scale.value, grown * last.sigma_t)
-    sigma_r = math.hypot(0.5 * _ANGULAR_ACCELERATION_RAD_S2 * gap**2, grown * last.sigma_r_rad)
+    sigma_t = math.hypot(0.5 * ACCELERATION_M_S2 * gap**2 / scale.value, grown * last.sigma_t)
+    sigma_r = math.hypot(0.5 * ANGULAR_ACCELERATION_RAD_S2 * gap**2, grown * last.sigma_r_rad)
     share_t, share_r = (b**2 / (a**2 + b**2) for a, b in ((prior.sigma_t, sigma_t), (prior.sigma_r_rad, sigma_r)))
     T = seen.T_w_c.copy()
     T[:3, 3] += share_t * (prior.T_w_c[:3, 3] - T[:3, 3])
@@ -108,7 +105,6 @@ class TelemetryPropagation:
     """Map axes to the power-on world ``(3, 3)``."""
     scale: ScaleEstimate
     fit: TelemetryFit
-    sigma_velocity_m_s: float
 
     def on(self, last: VisualPose, stamp_s: float) -> PoseEstimate | None:
         """Pose at a stamp; rotation only while the scale is unknown, ``None`` in a gap of telemetry."""
@@ -131,7 +127,7 @@ class TelemetryPropagation:
             moved = moved - self.fit.moved.bias * gap
         moved = moved + (R_w_b[1] - R_w_b[0]) @ self.T_b_c[:3, 3]
         T[:3, 3] = last.T[:3, 3] + self.R_w_m.T @ moved / scale.value
-        walk = self.sigma_velocity_m_s * math.sqrt(0.1 * gap) + 0.02 * gap
+        walk = VELOCITY_M_S * math.sqrt(0.1 * gap) + 0.02 * gap
         sigma_m = math.hypot(walk, float(np.linalg.norm(moved)) * scale.sigma / scale.value)
         sigma_t = last.sigma_t + sigma_m / scale.value
         sigma_r_rad = math.hypot(math.radians(0.5) + 0.002 * gap, late_rad)

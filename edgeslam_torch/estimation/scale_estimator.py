@@ -10,6 +10,7 @@ from edgeslam_torch.estimation.scale.depth_scale import DepthRatio, DepthRatios,
 from edgeslam_torch.estimation.scale.log_scale import LogScale, fuse
 from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, SensorGate
 from edgeslam_torch.estimation.telemetry_scale import TelemetryFit
+from edgeslam_torch.noise import DEPTH_SCALE_LOG
 from edgeslam_torch.types import ScaleEstimate
 
 _BELIEVED = 0.3
@@ -34,8 +35,8 @@ class ScaleEstimator:
     """
 
     def __init__(self, config: FusionConfig, focal_sigma: float) -> None:
-        self._depth_bias_log, self._focal_sigma = config.depth_bias_log, focal_sigma
-        self._depth = DepthRatios(self._depth_bias_log)
+        self._focal_sigma = focal_sigma
+        self._depth = DepthRatios(DEPTH_SCALE_LOG)
         truncates = config.velocity_rounding == "truncate"
         self.fit = TelemetryFit(shortfall_m_s=0.5 * config.velocity_step_m_s if truncates else 0.0)
         """Details of the fit of `sensor_scale`."""
@@ -58,7 +59,7 @@ class ScaleEstimator:
 
     def replace_depth_ratios(self, ratios: Sequence[DepthRatio]) -> None:
         """Replace the ratios of all keyframes after a change of the map's scale."""
-        self._depth = DepthRatios(self._depth_bias_log)
+        self._depth = DepthRatios(DEPTH_SCALE_LOG)
         for ratio in ratios:
             self._depth.add(ratio)
 
@@ -125,11 +126,6 @@ class ScaleEstimator:
         """Scale by the depth network alone; None before the first comparison."""
         depth = self._depth.scale()
         return None if depth is None else math.exp(depth.log_scale)
-
-    def network_wander_log(self) -> float:
-        """Variation of the depth network's ratio to the map between keyframes, in the logarithm."""
-        depth = self._depth.scale()
-        return 0.0 if depth is None else depth.wander_log
 
     def rough(self) -> float | None:
         """Rough scale, for thresholds on motion."""

@@ -10,23 +10,18 @@ from edgeslam_torch.estimation.scale.camera_mount import Turned
 from edgeslam_torch.estimation.scale.consensus import CONTRADICTION, at_odds, contradict, sided_with
 from edgeslam_torch.estimation.scale.joint_scale import (
     MIN_DISPLACEMENTS,
-    MOST_WANDER,
-    USUAL_WANDER,
     Evidence,
     aged_since,
     displacement_evidence,
     height_evidence,
     solved,
-    turned_since,
 )
 from edgeslam_torch.estimation.scale.log_scale import LogScale, floor_segments
 from edgeslam_torch.estimation.telemetry.comparison import FlightSoFar
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
-    LEAST_COUNT,
     AtOdds,
     Reading,
     SensorGate,
-    Verdict,
     agreement,
     changes,
 )
@@ -37,11 +32,20 @@ from edgeslam_torch.estimation.telemetry.velocity_quantisation import (
     seen_velocity,
 )
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements
+from edgeslam_torch.noise import (
+    HEIGHT_M,
+    HEIGHT_SCALE_LOG,
+    HEIGHT_STEP_M,
+    MAP_WANDER_LOG,
+    VELOCITY_M_S,
+    VELOCITY_SCALE_LOG,
+    VELOCITY_TRUNCATED_SCALE_LOG,
+)
 from edgeslam_torch.types import FloatArray, IntArray
 
 _MOST_ROUNDS = 5
 _SETTLED = 0.003
-"""Relative change of the scale below which the remainders are not recomputed: a third of `systematic_log`."""
+"""Relative change of the scale below which the remainders are not recomputed: a third of `VELOCITY_SCALE_LOG`."""
 _MOST_CHANGE = 0.5
 _UNDITHERED = 0.05
 """Residual error of the remainders [steps]. With 0.2 to 0.3 steps of noise before rounding, the mean reading is off by
@@ -51,9 +55,6 @@ _MOST_SIGMA = 0.5
 _GOOD_HEIGHT = 0.2
 """Relative sigma at which the search stops: the remaining height sources observe the same motion less accurately."""
 _HEIGHT_BIN_S = 0.5
-_HEIGHT_SOURCES = {"tof": "sigma_tof_m", "h": "sigma_h_m", "baro": "sigma_baro_m"}
-_HEIGHT_STEP_M = {"tof": 0.01, "h": 0.1, "baro": 0.01}
-"""Quantisation steps of the SDK's heights."""
 _OF_A_VIEW = 0.15
 """Typical change of the depth network's log scale between two views without overlap. The scales of submaps connected by
 pure rotation differ by as much: no parallax constrains them."""
@@ -62,12 +63,6 @@ _LEAST_CLIMB_SIGMAS = 2.0
 _LEAST_CHANGES = 2
 """Minimum number of such height changes within a second for a scale from heights alone; with fewer, drift of the sensor
 or of the map dominates the slope."""
-_LEAST_MOVING, _LEAST_SHARE, _ROUGH_LOG = 4, 0.25, 0.2
-"""Minimum number of moving intervals and minimum share of explained motion for a ratio of path lengths, and the error
-of that ratio."""
-_EXPLAINED = 0.98
-"""Correlation of velocities and images, means included, below which the unexplained motion exceeds 20 % RMS: more than
-quantisation to 0.1 m/s or a delay error of 0.25 s leaves."""
 _MOST_STEPS = 0.3
 """Maximum share of height readings classified as floor steps; furniture causes fewer."""
 
@@ -199,8 +194,8 @@ class TelemetryScale:
         fixed = {"nearest": Rounding.NEAREST, "truncate": Rounding.TRUNCATE}.get(config.velocity_rounding)
         sweeps = 0.0 if fixed else self._present.track.truncation_log_odds(config.velocity_step_m_s)
         systematic = {
-            Rounding.NEAREST: config.systematic_log,
-            Rounding.TRUNCATE: config.truncation_systematic_log,
+            Rounding.NEAREST: VELOCITY_SCALE_LOG,
+            Rounding.TRUNCATE: VELOCITY_TRUNCATED_SCALE_LOG,
         }
         tried = (Rounding.NEAREST, Rounding.TRUNCATE) if fixed is None else (fixed,)
         moved = {r: self._by_displacements(r) for r in tried}
@@ -241,8 +236,6 @@ class TelemetryScale:
             given = [g for g in given if g.name == odds.kept]
             if odds.kept == "height":  # recompute without the drift model of the rejected velocities
                 given = [g for g in (self._height_alone(rough, None),) if g is not None]
-        elif [g.name for g in given] == ["height"] and self._nonsense(given[0]):
-            given = []
         together = solved([g.evidence for g in given], tilt) if given else None
         if together is None:
             return None
@@ -270,7 +263,7 @@ class TelemetryScale:
         return None if single is None or single[1] >= _MOST_SIGMA else _Given(name, evidence, *single)
 
     def _height_alone(self, rough: float, moved: Evidence | None) -> _Given | None:
-        return self._alone("height", self._by_height(rough, moved), self._config.height_systematic_log, rough)
+        return self._alone("height", self._by_height(rough, moved), HEIGHT_SCALE_LOG, rough)
 
     def _at_odds(self, velocity: _Given, height: _Given) -> AtOdds | None:
         """Contradictory scales from velocities and heights, and which of them the depth network supports."""
@@ -279,21 +272,6 @@ class TelemetryScale:
             return None
         kept = sided_with(one, other, self._present.network)
         return AtOdds(velocity.scale, height.scale, None if kept is None else kept.source)
-
-    def _nonsense(self, height: _Given) -> bool:
-        """Whether a scale from heights alone contradicts the ratio of path lengths.
-
-        A distorted first second of the map also distorts a climb of decimetres in it. Velocities that explain a quarter
-        of the visual motion determine the scale to some tenths.
-        """
-        told = self._trust.latest.get(Reading.VELOCITY)
-        if told is None or told.count < _LEAST_MOVING or told.share < _LEAST_SHARE:
-            return False
-        shown = self._shown or self._compared()
-        if shown is None or not at_odds(height.opinion, LogScale(math.log(shown.start), _ROUGH_LOG, "telemetry")):
-            return False
-        self._trust.at_odds = AtOdds(shown.start, height.scale, None)
-        return True
 
     def _rough(self, moved: Evidence | None) -> float | None:
         """Rough scale for detecting floor steps: from velocities, unless the network contradicts them."""
@@ -332,14 +310,13 @@ class TelemetryScale:
         return softened
 
     def _evidence(self, moved: Displacements, moved_m: FloatArray, aged: FloatArray | None) -> Evidence | None:
-        config = self._config
         return displacement_evidence(
             moved.moved @ self._R_w_m.T,
             moved_m,
             moved.from_s,
             moved.duration_s,
             moved.sigma,
-            config.sigma_velocity_m_s * np.sqrt(0.1 * moved.duration_s),
+            VELOCITY_M_S * np.sqrt(0.1 * moved.duration_s),
             self._tilt_rad,
             aged,
         )
@@ -403,7 +380,7 @@ class TelemetryScale:
             if here.sum() < 2:
                 continue
             p = np.stack([np.interp(times[here], stamps_s, p_w[:, k]) for k in range(3)], axis=1)
-            sigma = getattr(config, _HEIGHT_SOURCES[name])
+            sigma = HEIGHT_M[name]
             segment = floor_segments(times[here], z[here], scale * p[:, 2], step_m=max(0.08, 4.0 * sigma))
             self._judge_height(Reading(name), p[:, 2:], z[here, None], times[here], segment, scale)
             if not self._trust.height(Reading(name)):
@@ -411,39 +388,16 @@ class TelemetryScale:
             if moved is None and self._trust.latest[Reading(name)].count < _LEAST_CHANGES:
                 continue
             tilt = self._tilt_rad
-            aged, wander = self._aged(times[here]), self._wander(moved)
-            if moved is None:
-                by_views = np.interp(times[here], stamps_s, self._of_other_views(seen.T, wander))
-                aged = by_views if aged is None else aged + by_views
+            aged, wander = self._aged(times[here]), MAP_WANDER_LOG[0] if moved is None else moved.wander
             evidence = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt, aged, wander)
             if evidence is not None:
-                evidence = evidence.softened(scale * _by_steps(z[here], _HEIGHT_STEP_M[name]))
+                evidence = evidence.softened(scale * _by_steps(z[here], HEIGHT_STEP_M[name]))
             single = solved([evidence], tilt) if evidence is not None else None
             if evidence is not None and single is not None and single[1] < best_sigma:
                 best, best_sigma = evidence, single[1]
             if best_sigma < _GOOD_HEIGHT:
                 break
         return best
-
-    def _of_other_views(self, T: FloatArray, wander: float) -> FloatArray:
-        """Equivalent log age ``(N,)`` for the loss of overlap since the views at ``T``, given the map's scale
-        wander."""
-        by_view = max(_OF_A_VIEW, self._present.network_wander_log)
-        return turned_since(T) * (by_view / wander) ** 2
-
-    def _wander(self, moved: Evidence | None) -> float:
-        """Scale wander of the map: from the displacements, or the maximum if velocities leave much unexplained.
-
-        Velocities with enough motion for validation that leave a fifth of the path unexplained indicate a map whose
-        scale changes along the way.
-        """
-        if moved is not None:
-            return moved.wander
-        tried = self._trust.latest.get(Reading.VELOCITY)
-        if tried is None or self._trust.verdict(Reading.VELOCITY) is Verdict.CONTRADICTS:  # telemetry of another flight
-            return USUAL_WANDER
-        parted = tried.count >= LEAST_COUNT and tried.steady < _EXPLAINED
-        return MOST_WANDER if parted else USUAL_WANDER
 
     def _judge_height(
         self,
@@ -457,6 +411,6 @@ class TelemetryScale:
         """Validate one height by its changes over a second; if most changes are steps, they are compared as well."""
         if segment[-1] > _MOST_STEPS * len(segment):
             segment = np.zeros_like(segment)
-        least = max(_LEAST_CLIMB_M, _LEAST_CLIMB_SIGMAS * getattr(self._config, _HEIGHT_SOURCES[reading]))
+        least = max(_LEAST_CLIMB_M, _LEAST_CLIMB_SIGMAS * HEIGHT_M[reading])
         seen, told = (changes(z, stamps_s, segment, _HEIGHT_BIN_S) for z in (z_map, z_m))
         self._trust.judge(reading, agreement(seen, told, least / scale, least))

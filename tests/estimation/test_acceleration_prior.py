@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.estimation.acceleration_prior import ACCELERATION_M_S2, inertia
+from edgeslam_torch.estimation.acceleration_prior import inertia
+from edgeslam_torch.noise import IMPLAUSIBLE_ACCELERATION_M_S2
 
 
 def cost(stamps, p, metres=1.0):
@@ -23,7 +24,7 @@ def test_an_even_motion_costs_nothing_whatever_the_gaps(rng):
 def test_acceleration_of_one_sigma_costs_one_per_inner_frame():
     """Positions of a constant acceleration: velocities between pictures change by it times half of both gaps."""
     stamps = np.array([0.0, 0.1, 0.3, 0.4])
-    assert cost(stamps, along_x(0.5 * ACCELERATION_M_S2 * stamps**2)) == pytest.approx(2.0)
+    assert cost(stamps, along_x(0.5 * IMPLAUSIBLE_ACCELERATION_M_S2 * stamps**2)) == pytest.approx(2.0)
 
 
 def test_cost_does_not_depend_on_the_map_unit():

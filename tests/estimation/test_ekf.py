@@ -14,6 +14,7 @@ from edgeslam_torch.geometry.rotations import (
     rpy_from_matrix,
     wrapped,
 )
+from edgeslam_torch.noise import ATTITUDE_RAD
 
 CONFIG = FusionConfig()
 
@@ -194,7 +195,7 @@ def test_gate_is_the_95_percent_quantile(degrees, share, outcome):
     ekf.predict(0.5, np.zeros(3))
     P = ekf.state(0.0).covariance
     if degrees == 3:
-        sigma = math.sqrt(P[3, 3] + CONFIG.sigma_attitude_rad**2)
+        sigma = math.sqrt(P[3, 3] + ATTITUDE_RAD**2)
         told = ekf.update_attitude(np.array([math.sqrt(share * CHI2_95[3]) * sigma, 0.0, 0.0]))
     else:
         sigma = math.sqrt(P[0, 0] + 0.05**2)
@@ -206,7 +207,7 @@ def test_gate_is_the_95_percent_quantile(degrees, share, outcome):
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"sigma_velocity_m_s": 0.0},
+        {"velocity_step_m_s": 0.0},
         {"beta": -1.0},
         {"gate_probability": 1.0},
         {"delay_range_s": (1.0, 0.0)},

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.displacement import TelemetryModel
-from edgeslam_torch.estimation.heading import DRIFT_RAD_S, HEADING_RAD, TURN_SHARE, headings
+from edgeslam_torch.estimation.heading import headings
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.noise import HEADING_DRIFT_RAD_S, HEADING_RAD, TURN_SHARE
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
 
 T_B_C = camera_on_body()
@@ -51,7 +52,7 @@ def test_a_common_turn_costs_nothing_and_one_keyframe_alone_its_sigma(rng, swing
     assert chi2(told, common) < 0.02
     assert chi2(told, alone) == pytest.approx(1.0, rel=0.3)
     step = np.where(np.arange(n) < n // 2, 0.0, 2.0 * HEADING_RAD)
-    drift = DRIFT_RAD_S * (stamps_s - stamps_s[0])
+    drift = HEADING_DRIFT_RAD_S * (stamps_s - stamps_s[0])
     assert chi2(told, step) > 10.0
     assert chi2(told, drift) < 1.1
 

@@ -2,14 +2,12 @@ import math
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.scale.joint_scale import (
     aged_since,
     displacement_evidence,
     height_evidence,
     solved,
-    turned_since,
 )
 from edgeslam_torch.estimation.scale.log_scale import floor_segments
 from edgeslam_torch.geometry.rotations import matrix_from_rpy
@@ -270,14 +268,3 @@ def test_heights_of_an_old_climb_are_less_sure_of_the_present_scale(rng):
 def test_log_age_grows_most_in_a_new_map():
     aged = aged_since(np.array([-1.0, 0.0, 1.0, 9.0, 19.0]), 0.0, 19.0)
     assert aged == pytest.approx([math.log(20.0), math.log(20.0), math.log(10.0), math.log(2.0), 0.0])
-
-
-def test_widths_of_view_since_a_turn():
-    """To the side by 90 degrees and back by 30: what was seen before the turn is most of two views away."""
-    yaw = np.deg2rad([0.0, 0.0, 45.0, 90.0, 75.0, 60.0])
-    T = np.tile(np.eye(4), (6, 1, 1))
-    T[:, :3, :3] = Rotation.from_euler("Y", yaw[:, None]).as_matrix()
-    np.testing.assert_allclose(turned_since(T), [1.0, 1.0, 0.5, 0.5, 0.25, 0.0], atol=1e-6)
-    moved = T.copy()
-    moved[:, :3, 3] = 5.0
-    np.testing.assert_allclose(turned_since(moved), turned_since(T))

@@ -15,6 +15,7 @@ from edgeslam_torch.estimation.telemetry.velocity_quantisation import Rounding
 from edgeslam_torch.estimation.telemetry_scale import TelemetryFit, TelemetryScale
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.noise import DEPTH_SCALE_LOG
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
 from edgeslam_torch.types import ScaleEstimate, TelemetrySample, Units
 
@@ -213,7 +214,7 @@ def test_depth_network_alone_gives_a_scale_with_its_sigma(swinging):
     scale = fusion.scale()
     assert (scale.source, scale.units) == ("depth", Units.METRES)
     assert scale.value == pytest.approx(3.0)
-    assert FusionConfig().depth_bias_log < scale.sigma / scale.value < 0.2
+    assert DEPTH_SCALE_LOG < scale.sigma / scale.value < 0.2
 
 
 def test_metres_of_an_earlier_flight_take_the_place_of_the_networks():

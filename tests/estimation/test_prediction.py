@@ -33,7 +33,7 @@ def test_exact_telemetry_carries_the_camera_to_where_it_is(rng, swinging, gap_s)
         T[:, :3, 3] *= 0.5
         last = VisualPose(motion.stamps_s[i] + 2 * DELAY_S, T[i], 1e-3, 1e-3)
         carried = TelemetryPropagation(
-            track, DELAY_S, 0.0, T_B_C, np.eye(3), ScaleEstimate(2.0, 0.02, "known"), TelemetryFit(), 0.05
+            track, DELAY_S, 0.0, T_B_C, np.eye(3), ScaleEstimate(2.0, 0.02, "known"), TelemetryFit()
         )
         found = carried.on(last, motion.stamps_s[now] + 2 * DELAY_S)
         errors.append(np.linalg.norm(found.T_w_c[:3, 3] - T[now, :3, 3]))
@@ -64,7 +64,7 @@ def test_a_turn_is_as_sure_as_the_delay_is_known(rng, swinging):
         now, T = i + 16, motion.T_w_c
         last = VisualPose(motion.stamps_s[i] + 2 * DELAY_S, T[i], 1e-3, 1e-3)
         known = ScaleEstimate(1.0, 0.02, "known")
-        carried = TelemetryPropagation(track, DELAY_S - wrong_s, np.inf, T_B_C, np.eye(3), known, TelemetryFit(), 0.05)
+        carried = TelemetryPropagation(track, DELAY_S - wrong_s, np.inf, T_B_C, np.eye(3), known, TelemetryFit())
         found = carried.on(last, motion.stamps_s[now] + 2 * DELAY_S)
         off.append(np.linalg.norm(se3.log(se3.inverse(T[now]) @ found.T_w_c)[3:]))
         sigma.append(found.sigma_r_rad)

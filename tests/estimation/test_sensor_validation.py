@@ -3,7 +3,6 @@
 import math
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from edgeslam_torch.estimation.telemetry.sensor_validation import (
     agreement,
     changes,
 )
-from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 
@@ -386,23 +384,6 @@ def test_validated_velocities_without_a_scale_are_reported():
     assert trust.warnings() == []
     trust.tells_scale = False
     assert any("too badly to tell a scale" in w for w in trust.warnings())
-
-
-@pytest.mark.parametrize(
-    ("by_height", "correlation", "count", "nonsense"),
-    [(0.34, 0.7, 5, True), (2.2, 0.7, 5, False), (0.34, 0.4, 5, False), (0.34, 0.7, 3, False)],
-)
-def test_height_scale_is_rejected_by_the_ratio_of_path_lengths(by_height, correlation, count, nonsense):
-    """By the length of the way, three metres a unit; the height of a map whose first second is wrong says a tenth."""
-    scale = TelemetryScale.__new__(TelemetryScale)
-    scale._trust, scale._shown = SensorGate(), SimpleNamespace(start=3.0)
-    scale._trust.judge(Reading.VELOCITY, Agreement(correlation, count))
-    assert (
-        scale._nonsense(SimpleNamespace(scale=by_height, opinion=LogScale(math.log(by_height), 0.2, "height")))
-        == nonsense
-    )
-    said = any("velocities and heights contradict each other" in w for w in scale._trust.warnings())
-    assert said == nonsense
 
 
 def test_heights_beside_velocities_that_leave_much_unexplained_tell_nothing_yet(rng, swinging, replay):

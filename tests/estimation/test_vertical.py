@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.estimation.config import FusionConfig
-from edgeslam_torch.estimation.displacement import DELAY_S
 from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.estimation.telemetry.sensor_validation import Agreement, Reading
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.noise import DELAY_S
 from edgeslam_torch.types import TelemetrySample
 
 T_B_C = camera_on_body(0.0)

@@ -21,6 +21,13 @@ from scipy.special import chdtri  # scipy.stats takes a second of CPU to import
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.filter.relative import relative_measurement
 from edgeslam_torch.geometry.rotations import euler_rate_matrix, matrix_from_rpy, rpy_from_matrix, wrapped
+from edgeslam_torch.noise import (
+    ATTITUDE_RAD,
+    ATTITUDE_WALK_RAD_SQRT_S,
+    POSITION_FLOOR_M_SQRT_S,
+    VELOCITY_BIAS_WALK_M_S_SQRT_S,
+    VELOCITY_M_S,
+)
 from edgeslam_torch.types import FloatArray
 
 _P, _A, _B = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -85,7 +92,6 @@ class Ekf:
         self.config = config
         self.x: FloatArray = np.zeros(_SIZE)
         self.P: FloatArray = np.zeros((_SIZE, _SIZE))
-        self.P[range(3), range(3)] = config.initial_sigma_position_m**2
         self.P[range(3, 6), range(3, 6)] = config.initial_sigma_angle_rad**2
         if config.sigma_bias_m_s > 0 and not config.literal:
             self.P[range(6, 9), range(6, 9)] = config.sigma_bias_m_s**2
@@ -135,10 +141,10 @@ class Ekf:
             P[:, _P] -= dt_s * P[:, _B]
         x[_P] += dt_s * moved
         growth = 1.0 + config.beta * spent + config.lambda_tau * min(self.tau_s, 60.0)
-        position = dt_s * (0.1 * config.sigma_velocity_m_s**2 * growth + config.floor_position_m**2)
+        position = dt_s * (0.1 * VELOCITY_M_S**2 * growth + POSITION_FLOOR_M_SQRT_S**2)
         x[_A] += dt_s * rpy_rate_rad_s
-        turning = dt_s * config.sigma_turn_rad_sqrt_s**2
-        bias = dt_s * config.bias_walk_m_s_sqrt_s**2 * growth if config.sigma_bias_m_s > 0 else 0.0
+        turning = dt_s * ATTITUDE_WALK_RAD_SQRT_S**2
+        bias = dt_s * VELOCITY_BIAS_WALK_M_S_SQRT_S**2 * growth if config.sigma_bias_m_s > 0 else 0.0
         # A reading's error lasts as long as the reading, 0.1 s: dt * 0.1 s of variance, not dt^2.
         diagonal = P.ravel()[:: _SIZE + 1]
         diagonal[_P] += position
@@ -169,7 +175,7 @@ class Ekf:
 
     def update_attitude(self, rpy_rad: FloatArray, sigma_rad: float | None = None) -> Outcome:
         """Euler angles from the drone, paper eqs. (11)-(12)."""
-        sigma = self.config.sigma_attitude_rad if sigma_rad is None else sigma_rad
+        sigma = ATTITUDE_RAD if sigma_rad is None else sigma_rad
         residual = rpy_rad - self.x[_A]
         if not self.config.literal:
             _wrap_in_place(residual, (0, 1, 2))
@@ -253,7 +259,7 @@ class Ekf:
         J[6:, _B] = -R_c.T @ turned
         J[6:, _CLONE_A] = -R_c.T @ _cross_columns(euler_rate_matrix(x[_CLONE_A]), velocity_w)
         covariance = J @ self.P @ J.T
-        covariance[range(6, 9), range(6, 9)] += config.sigma_velocity_m_s**2
+        covariance[range(6, 9), range(6, 9)] += VELOCITY_M_S**2
         return Relative(T, R_c.T @ velocity_w, 0.5 * (covariance + covariance.T))
 
     def _after_visual(self, outcome: Outcome) -> None:

@@ -16,6 +16,7 @@ from edgeslam_torch.estimation.telemetry.delay import Delay
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualPose
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.rotations import matrix_from_rpy, rotation_vector
+from edgeslam_torch.noise import VISUAL_DRIFT, VISUAL_DRIFT_TURN, VISUAL_JITTER_M, VISUAL_JITTER_RAD
 from edgeslam_torch.types import FloatArray, ScaleEstimate, TelemetrySample
 
 _SAME_S = 1e-6
@@ -23,12 +24,6 @@ _SURE = 0.2
 """Maximum relative sigma of the scale: over a video's delay, 0.2 m of flight at most, that is an error of 4 cm."""
 _DELAY_MOVED_S = 0.003
 """Change of the estimated delay after which increments restart: one across it would cover a wrong interval."""
-_DRIFT = 0.01
-"""Standard deviation of the drift from frame to frame, as a share of the distance travelled."""
-_DRIFT_TURN = 0.003
-"""The same as a share of the angle turned."""
-_JITTER_M, _JITTER_RAD = 0.002, 0.001
-"""Minimum noise of a tracked pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,15 +105,15 @@ class FilterFeed:
         T_c[:3, 3] *= scale.value
         T_b = self._T_b_c @ T_c @ se3.inverse(self._T_b_c)
         jitter = PoseSigma(
-            math.hypot(visual.sigma_t * scale.value, _JITTER_M), math.hypot(visual.sigma_r_rad, _JITTER_RAD)
+            math.hypot(visual.sigma_t * scale.value, VISUAL_JITTER_M), math.hypot(visual.sigma_r_rad, VISUAL_JITTER_RAD)
         )
         from_s = seen.stamp_s - self._delay.value_s
         if self._config.literal:
             self._add_accumulated(from_s, stamp_s, T_b, jitter)
             return
-        share = math.hypot(_DRIFT, scale.sigma / scale.value)
+        share = math.hypot(VISUAL_DRIFT, scale.sigma / scale.value)
         turned = float(np.linalg.norm(rotation_vector(T_c[:3, :3])))
-        drift = PoseSigma(share * float(np.linalg.norm(T_c[:3, 3])), _DRIFT_TURN * turned)
+        drift = PoseSigma(share * float(np.linalg.norm(T_c[:3, 3])), VISUAL_DRIFT_TURN * turned)
         self.ekf.add_relative(from_s, stamp_s, T_b, drift, jitter)
 
     def _add_accumulated(self, from_s: float, to_s: float, T_b: FloatArray, sigma: PoseSigma) -> None:

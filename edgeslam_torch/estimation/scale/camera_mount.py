@@ -7,10 +7,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.geometry.rotations import mean_rotation
+from edgeslam_torch.noise import LEVEL_RAD, UP_MEMORY_S
 from edgeslam_torch.types import FloatArray
 
-_ATTITUDE_RAD, _ATTITUDE_MEMORY_S = math.radians(1.0), 5.0
-"""Error of roll and pitch under acceleration, and its correlation time."""
 _BENT_RAD = math.radians(1.0)
 """Variation of a map's orientation from place to place."""
 _STEPS = 3
@@ -45,9 +44,9 @@ def mount_by_turns(
         R_b_c: Configured camera to body ``(3, 3)``.
         sigma_rad: Its standard deviation per axis.
     """
-    memory_s = 0.5 * _ATTITUDE_MEMORY_S
+    memory_s = 0.5 * UP_MEMORY_S
     alike = np.searchsorted(stamps_s, stamps_s + memory_s, "right") - np.searchsorted(stamps_s, stamps_s - memory_s)
-    weight = 1.0 / (_ATTITUDE_RAD**2 * alike)
+    weight = 1.0 / (LEVEL_RAD**2 * alike)
     R_w_m = mean_rotation(R_w_b @ R_b_c @ np.swapaxes(R_m_c, 1, 2))
     R_b_w = np.swapaxes(R_w_b, 1, 2)
     J = np.concatenate([R_b_w, np.broadcast_to(-np.eye(3), R_b_w.shape)], axis=2)  # by rotations of R_w_m, R_b_c

@@ -1,4 +1,4 @@
-r"""Metric scale from velocity and height together, with noise models selected by the flight's residuals.
+r"""Metric scale from velocity and height together, in a map whose scale may wander as much as the residuals say.
 
 Unknowns are :math:`\theta = (s, s\,\delta)`: metres per map unit and a small rotation of the map against the drone's
 world. Both kinds of measurement are linear in them, so each gives information on :math:`\theta` and the two add up:
@@ -8,9 +8,7 @@ world. Both kinds of measurement are linear in them, so each gives information o
     h_j = s\,z_j + (s\,\delta \times p_j)_z + c_k + w_j + \epsilon_j
 
 with velocity bias :math:`b` and drift of the visual position :math:`w` that decorrelate in seconds (Ornstein-Uhlenbeck;
-only the drift's change over an interval counts, so that long paths weigh more than oscillations in place). Their
-magnitudes maximise the restricted likelihood of the residuals (Patterson and Thompson 1971): distortion of the map by
-tilt or slow drift must not be modelled as white noise, which averages out, nor vice versa.
+only the drift's change over an interval counts, so that long paths weigh more than oscillations in place).
 """
 
 import math
@@ -21,6 +19,13 @@ from scipy.linalg import cho_solve, lapack
 
 from edgeslam_torch.geometry.robust_statistics import RMS_MEDIAN_3DOF, median, robust_sigma, tukey_weight
 from edgeslam_torch.geometry.se3 import hat
+from edgeslam_torch.noise import (
+    MAP_DRIFT_M,
+    MAP_DRIFT_MEMORY_S,
+    MAP_WANDER_LOG,
+    VELOCITY_BIAS_M_S,
+    VELOCITY_BIAS_MEMORY_S,
+)
 from edgeslam_torch.types import FloatArray, IntArray
 
 _LEAST_WEIGHT = 1e-3
@@ -30,28 +35,15 @@ MIN_DISPLACEMENTS = 6
 _MIN_HEIGHTS = 4
 _BELIEF = 20.0
 """Weight of the expected noise against the observed one, in residuals."""
-_USUAL_BIAS_M_S = 0.01
-_USUAL = (_USUAL_BIAS_M_S, 0.03)
-"""Prior standard deviations of the velocity bias [m/s] and of the visual drift [m]."""
-_BIAS_AND_DRIFT = ((0.003, 0.002), (0.01, 0.002), (0.03, 0.002), (0.003, 0.03), _USUAL, (0.03, 0.03), (0.1, 0.03))
-"""Candidates."""
-_BIAS_MEMORY_S = 12.0
-_DRIFT_M = (0.002, 0.006, 0.02, 0.06)
-_DRIFT_MEMORY_S = 4.0
-USUAL_WANDER, MOST_WANDER = 0.03, 0.81
-_WANDER = (USUAL_WANDER, 0.09, 0.27, MOST_WANDER)
-"""Candidate standard deviations of the change of the log scale per e-fold of the map's age: 2 to 14 % in the first
-seconds, later 1 to 2 %; with few features the scale may triple. The default is the minimum: velocities of one flight do
-not distinguish 1 from 3 %."""
-_VIEW_RAD = math.radians(60.0)
-"""Typical field of view."""
+_WHEN_TOLD_APART = 2
+"""Iteration in which the map's wander is selected: by then the worst outliers are downweighted."""
+_MOST_PARTS = 4
+"""Maximum number of parts of a flight whose scales are compared; shorter parts are too noisy."""
 _YOUNG_S = 1.0
 """Lower bound of the map's age."""
 _BIN_S = 0.5
 _SCALE, _THETA, _OFFSETS = 0, slice(0, 4), slice(4, None)
 """Slices of the vector of unknowns; heights append an offset per segment to theta."""
-_WHEN_TOLD_APART = 2
-"""Iteration in which the noise model is selected: by then the worst outliers are downweighted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +60,8 @@ class Evidence:
     """``(3,)`` velocity bias at the end [m/s]; zeros for heights."""
     log_likelihood: float = 0.0
     """Of the displacements, up to a constant, for comparing models of the same data."""
-    wander: float = USUAL_WANDER
-    """Standard deviation of the map's scale change; estimated by displacements only."""
+    wander: float = MAP_WANDER_LOG[0]
+    """Change of the map's log scale per e-fold of its age; estimated by displacements only."""
     torn: bool = False
     """Whether no single scale fits most of the visual path."""
 
@@ -137,44 +129,50 @@ def displacement_evidence(
         return None
     sigma_map = np.minimum(sigma_map, 0.3 * math.sqrt(length / (3 * n)))
     apart_s = from_s[:, None] - from_s[None]
-    bias = np.exp(-np.abs(apart_s) / _BIAS_MEMORY_S) * np.outer(duration_s, duration_s)
-    drift = _of_changes(apart_s, duration_s, _DRIFT_MEMORY_S)
+    memory = np.exp(-np.abs(apart_s) / VELOCITY_BIAS_MEMORY_S)
+    bias = VELOCITY_BIAS_M_S**2 * memory * np.outer(duration_s, duration_s)
     s = math.sqrt(float(np.sum(moved_m**2)) / length)
     if not (math.isfinite(s) and s > 1e-9):
         return None
-    wandering = np.zeros((n, n)) if aged is None else s**2 * _common(aged) * (moved_map @ moved_map.T)
-    possible = {
-        (a, b, c): _slow(a**2 * bias, b**2 * drift + c**2 * wandering, a, c)
-        for a, b in _BIAS_AND_DRIFT
-        for c in ((USUAL_WANDER,) if aged is None else _WANDER)
-    }
-    noise = replace(possible[*_USUAL, USUAL_WANDER], log_prior=0.0)
+    drifting = _of_changes(apart_s, duration_s, MAP_DRIFT_MEMORY_S)
+    wandering = 0.0 * bias if aged is None else s**2 * _common(aged) * (moved_map @ moved_map.T)
     J = np.concatenate([moved_map[:, :, None], -hat(moved_map)], axis=2).transpose(1, 0, 2)  # (3, N, 4)
     target = moved_m.T[:, :, None]  # (3, N, 1)
     weight: FloatArray = np.ones(n)
-    latent, fit, wander = J, None, USUAL_WANDER
-    for iteration in range(5):
+    wanders = (MAP_WANDER_LOG[0],) if aged is None else MAP_WANDER_LOG
+    possible = [(a, c) for a in MAP_DRIFT_M for c in wanders]
+    chosen = possible[0]
+    latent, fit = J, None
+    for k in range(5):
         white = (sigma_m**2 + (s * sigma_map) ** 2) / np.maximum(weight, _LEAST_WEIGHT)
-        tried = list(possible.values()) if iteration == _WHEN_TOLD_APART else [noise]
-        fit = _best(white, tried, J, latent, target, _tilt_prior(s, tilt_sigma_rad))
+        prior = _tilt_prior(s, tilt_sigma_rad)
+        likeliest = -math.inf
+        for a, c in possible if k == _WHEN_TOLD_APART else [chosen]:
+            slow = bias + a**2 * drifting + c**2 * wandering
+            found = _fitted(white, slow, J, latent, target, prior)
+            if found is not None and found.log_likelihood > likeliest:
+                fit, chosen, likeliest = found, (a, c), found.log_likelihood
         if fit is None or not fit.theta[_SCALE] > 1e-9:
             return None
-        noise, s = fit.noise, float(fit.theta[_SCALE])
-        wander = fit.wander if len(tried) > 1 else wander
+        s = float(fit.theta[_SCALE])
         clean = fit.residual - fit.slow  # (3, N)
         variance = sigma_m**2 + (s * sigma_map) ** 2
         normalised = np.sqrt(np.sum(clean**2, axis=0) / (3.0 * variance))
         spread = max(median(normalised) / RMS_MEDIAN_3DOF, 0.3)
         weight = tukey_weight(normalised, spread)
-        drift = fit.slow - fit.bias  # the map's, so it is in the regressor as well
+        drift = fit.slow - fit.whitened @ bias  # the map's, so it is in the regressor as well
         partner = moved_map + ((s * sigma_map**2 / variance) * clean + drift / s).T
         latent = np.concatenate([partner[:, :, None], -hat(partner)], axis=2).transpose(1, 0, 2)
     if fit is None or float(weight.sum()) < MIN_DISPLACEMENTS:
         return None
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(3.0 * float(weight.sum()), 1e-9))
-    bias_m_s = fit.bias[:, -1] / duration_s[-1]
+    bias_m_s = (fit.whitened @ bias)[:, -1] / duration_s[-1]
     torn = float(weight @ np.sum(moved_map**2, axis=1)) < _MIN_EXPLAINED * length
-    return Evidence(fit.information, fit.vector, rms, bias_m_s, fit.log_likelihood, wander, torn=torn)
+    evidence = Evidence(fit.information, fit.vector, rms, bias_m_s, fit.log_likelihood, chosen[1], torn)
+    covariance = (
+        bias + chosen[0] ** 2 * drifting + chosen[1] ** 2 * wandering + np.diag(sigma_m**2 + (s * sigma_map) ** 2)
+    )
+    return evidence.softened(_unrest(covariance, fit, J, latent, target))
 
 
 def height_evidence(
@@ -187,7 +185,7 @@ def height_evidence(
     scale: float,
     tilt_sigma_rad: float | FloatArray,
     aged: FloatArray | None = None,
-    wander: float = USUAL_WANDER,
+    wander: float = MAP_WANDER_LOG[0],
 ) -> Evidence | None:
     """Evidence from height above the floor against visual height, with a free offset per segment without floor step.
 
@@ -201,7 +199,7 @@ def height_evidence(
         scale: Rough metres per map unit.
         tilt_sigma_rad: Prior on the rotation; ``(3,)``, about each axis, or one for all.
         aged: As in `displacement_evidence`, ``(N,)``.
-        wander: Standard deviation of the map's scale change, from the displacements.
+        wander: Change of the map's log scale per e-fold of its age, from the displacements.
     """
     if len(z_m) < 2 * _MIN_HEIGHTS:
         return None
@@ -223,22 +221,22 @@ def height_evidence(
     offsets[np.arange(n), stretch] = 1.0
     J = np.column_stack([p[:, 2], p[:, 1], -p[:, 0], np.zeros(n), offsets])[None]  # (delta x p)_z = dx y - dy x
     together = stretch[:, None] == stretch[None]
-    memory = np.exp(-np.abs(t[:, None] - t[None]) / _DRIFT_MEMORY_S) * together
-    wandering = np.zeros((n, n))
+    memory = np.exp(-np.abs(t[:, None] - t[None]) / MAP_DRIFT_MEMORY_S) * together
+    wandering = 0.0 * memory
     if aged is not None:
         risen = np.tril(together) * np.diff(p[:, 2], prepend=p[0, 2])[None]  # sums of these are heights up to offsets
         wandering = (wander * scale) ** 2 * (risen @ _common(np.interp(t, stamp_s, aged)) @ risen.T)
     prior = _tilt_prior(scale, tilt_sigma_rad, K)
     weight: FloatArray = np.ones(n)
     fit = None
-    for iteration in range(4):
+    drift = MAP_DRIFT_M[0]
+    for k in range(4):
         white = (sigma_m**2 + (scale * sigma_map) ** 2) / count / np.maximum(weight, _LEAST_WEIGHT)
-        tried = (
-            [_Slow(a**2 * memory + wandering, 0.0 * memory, 0.0) for a in _DRIFT_M]
-            if fit is None or iteration == _WHEN_TOLD_APART
-            else [fit.noise]
-        )
-        fit = _best(white, tried, J, J, z[None, :, None], prior)
+        likeliest = -math.inf
+        for a in MAP_DRIFT_M if k == _WHEN_TOLD_APART else [drift]:
+            found = _fitted(white, a**2 * memory + wandering, J, J, z[None, :, None], prior)
+            if found is not None and found.log_likelihood > likeliest:
+                fit, drift, likeliest = found, a, found.log_likelihood
         if fit is None:
             return None
         clean = fit.residual[0] - fit.slow[0]
@@ -258,16 +256,37 @@ def height_evidence(
     return Evidence(0.5 * (information + information.T), vector, rms, np.zeros(3))
 
 
+def _unrest(covariance: FloatArray, fit: "_Fit", J: FloatArray, latent: FloatArray, target: FloatArray) -> float:
+    """Error of the mean scale [m per map unit] due to differences between parts of the flight beyond their noise.
+
+    Scale drift of the map, or telemetry that is right only in part, does not show in the residuals within a part.
+    Outliers of the fit are included: they may be a part of the map with another scale. The variance between parts is
+    that of a random-effects model (DerSimonian and Laird 1986).
+    """
+    n = len(covariance)
+    parts = min(_MOST_PARTS, n // MIN_DISPLACEMENTS)
+    if parts < 2:
+        return 0.0
+    scale, information = np.zeros(parts), np.zeros(parts)
+    for k, i in enumerate(np.array_split(np.arange(n), parts)):
+        inverse = np.linalg.inv(covariance[np.ix_(i, i)])
+        A = np.einsum("anu,anv->uv", latent[:, i], inverse @ J[:, i])[_SCALE]
+        v = float(np.einsum("an,anx->", latent[:, i, _SCALE], inverse @ target[:, i]))
+        information[k] = max(float(A[_SCALE]), 0.0)
+        scale[k] = (v - float(A[1:] @ fit.theta[1:])) / max(float(A[_SCALE]), 1e-30)
+    information /= fit.kappa
+    total, squares = float(information.sum()), float(np.sum(information**2))
+    room = total - squares / max(total, 1e-30)
+    if not room > 0:
+        return 0.0
+    apart = float(np.sum(information * (scale - np.sum(information * scale) / total) ** 2))
+    between = max(0.0, (apart - (parts - 1)) / room)
+    return math.sqrt(between * squares) / total
+
+
 def aged_since(stamps_s: FloatArray, began_s: float, now_s: float) -> FloatArray:
     """Log of the map's age now over its age at each stamp ``(N,)``; a map drifts most in its first seconds."""
     return np.asarray(np.log((now_s - began_s + _YOUNG_S) / (np.maximum(stamps_s - began_s, 0.0) + _YOUNG_S)))
-
-
-def turned_since(T: FloatArray) -> FloatArray:
-    """Maximum rotation since each pose ``T`` ``(N, 4, 4)`` relative to the last one, in fields of view ``(N,)``."""
-    cosine = 0.5 * (np.einsum("nij,ij->n", T[:, :3, :3], T[-1, :3, :3]) - 1.0)
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    return np.asarray(np.maximum.accumulate(angle[::-1])[::-1] / _VIEW_RAD)
 
 
 def _common(aged: FloatArray) -> FloatArray:
@@ -286,84 +305,45 @@ def _of_changes(apart_s: FloatArray, duration_s: FloatArray, memory_s: float) ->
 
 
 @dataclass(frozen=True, slots=True)
-class _Slow:
-    """Correlated noise: covariance ``(N, N)``, the part due to velocity bias, log prior, variation of the scale."""
-
-    covariance: FloatArray
-    bias: FloatArray
-    log_prior: float
-    wander: float = USUAL_WANDER
-
-
-def _slow(bias: FloatArray, drift: FloatArray, sigma_bias_m_s: float, wander: float) -> _Slow:
-    rare = math.log(sigma_bias_m_s / _USUAL_BIAS_M_S, 3.0) ** 2 + math.log(wander / USUAL_WANDER, 3.0) ** 2
-    return _Slow(bias + drift, bias, -0.5 * rare, wander)
-
-
-@dataclass(frozen=True, slots=True)
 class _Fit:
     theta: FloatArray
     information: FloatArray
     vector: FloatArray
     residual: FloatArray
+    whitened: FloatArray
+    """``(axes, N)``, the residual times the inverse covariance."""
     slow: FloatArray
-    """``(axes, N)``, the part of the residual due to bias or drift."""
-    bias: FloatArray
-    """``(axes, N)``, the part due to bias."""
-    noise: _Slow
+    """``(axes, N)``, the part of the residual due to correlated noise."""
     inverse_trace: float
     kappa: float
     """Variance of the residuals over the expected one."""
     log_likelihood: float
-    wander: float = USUAL_WANDER
-    """Posterior RMS over the candidates."""
 
 
-def _best(
-    white: FloatArray,
-    tried: list[_Slow],
-    J: FloatArray,
-    latent: FloatArray,
-    target: FloatArray,
-    prior: FloatArray,
+def _fitted(
+    white: FloatArray, slow: FloatArray, J: FloatArray, latent: FloatArray, target: FloatArray, prior: FloatArray
 ) -> _Fit | None:
-    """Generalised least squares ``(axes, N, unknowns)`` with the most likely correlated noise."""
-    best, likeliest = None, -math.inf
-    told: list[tuple[float, float]] = []
+    """Generalised least squares ``(axes, N, unknowns)`` with independent ``(N,)`` and correlated noise ``(N, N)``."""
     n = len(white)
-    for noise in tried:
-        C = noise.covariance.copy()
-        C.flat[:: n + 1] += white
-        factor, info = lapack.dpotrf(C, lower=True)
-        if info != 0:
-            continue
-        inverse = cho_solve((factor, True), np.eye(n), check_finite=False)
-        weighted = inverse @ J  # (axes, N, unknowns)
-        A = np.einsum("anu,anv->uv", latent, weighted)
-        A = 0.5 * (A + A.T)
-        v = np.einsum("anu,anx->u", latent, inverse @ target)
-        try:
-            theta = np.linalg.solve(A + prior, v)
-        except np.linalg.LinAlgError:
-            continue
-        residual = (target[:, :, 0] - J @ theta).reshape(len(J), n)
-        whitened = residual @ inverse
-        dof = residual.size + _BELIEF
-        kappa = (float(np.sum(residual * whitened)) + _BELIEF) / dof
-        sign, logdet = np.linalg.slogdet(A + prior)
-        spent = 2.0 * len(J) * float(np.sum(np.log(np.diag(factor)))) + (float(logdet) if sign > 0 else math.inf)
-        likely = noise.log_prior - 0.5 * (dof * math.log(kappa) + spent)
-        told.append((likely, noise.wander))
-        if likely > likeliest:
-            likeliest = likely
-            slow, bias = whitened @ noise.covariance, whitened @ noise.bias
-            trace = float(np.trace(inverse)) / kappa
-            best = _Fit(theta, A / kappa, v / kappa, residual, slow, bias, noise, trace, kappa, likely)
-    return None if best is None else replace(best, wander=_expected(told))
-
-
-def _expected(told: list[tuple[float, float]]) -> float:
-    """Posterior RMS of the scale variation, from (log-likelihood, variation) pairs."""
-    likely, wander = np.array(told).T
-    share = np.exp(likely - likely.max())
-    return math.sqrt(float(np.sum(share * wander**2) / np.sum(share)))
+    C = slow.copy()
+    C.flat[:: n + 1] += white
+    factor, info = lapack.dpotrf(C, lower=True)
+    if info != 0:
+        return None
+    inverse = cho_solve((factor, True), np.eye(n), check_finite=False)
+    A = np.einsum("anu,anv->uv", latent, inverse @ J)  # J is (axes, N, unknowns)
+    A = 0.5 * (A + A.T)
+    v = np.einsum("anu,anx->u", latent, inverse @ target)
+    try:
+        theta = np.linalg.solve(A + prior, v)
+    except np.linalg.LinAlgError:
+        return None
+    residual = (target[:, :, 0] - J @ theta).reshape(len(J), n)
+    whitened = residual @ inverse
+    dof = residual.size + _BELIEF
+    kappa = (float(np.sum(residual * whitened)) + _BELIEF) / dof
+    sign, logdet = np.linalg.slogdet(A + prior)
+    spent = 2.0 * len(J) * float(np.sum(np.log(np.diag(factor)))) + (float(logdet) if sign > 0 else math.inf)
+    likely = -0.5 * (dof * math.log(kappa) + spent)
+    trace = float(np.trace(inverse)) / kappa
+    return _Fit(theta, A / kappa, v / kappa, residual, whitened, whitened @ slow, trace, kappa, likely)

@@ -57,8 +57,6 @@ class FlightSoFar:
     """Metres per map unit, for what counts as motion."""
     network: LogScale | None = None
     """Scale by the depth network, which decides between contradictory velocities and heights."""
-    network_wander_log: float = 0.0
-    """Variation of the network's log scale between keyframes."""
 
 
 class Comparison:

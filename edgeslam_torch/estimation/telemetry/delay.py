@@ -9,6 +9,7 @@ from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.telemetry.alignment import map_to_world, turns
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, VisualMemory
+from edgeslam_torch.noise import ATTITUDE_RAD, CLOCK_S, VELOCITY_M_S
 from edgeslam_torch.types import FloatArray
 
 _MIN_DISPLACEMENTS = 8
@@ -25,7 +26,6 @@ _MOST_SIGMA_S = 0.05
 _VALLEY_S = 0.15
 _CLEARLY = 6.0
 """Minimum log-likelihood ratio to the second-best local minimum."""
-_CLOCK_SIGMA_S = 0.005
 _KEPT = 0.9
 """Share of the residuals used; the rest may be outliers."""
 
@@ -66,7 +66,7 @@ class DelaySearch:
         found = _least(delays_s, cost)
         if found is not None:
             value_s = float(np.clip(found.value_s, low, high))
-            self.delay = Delay(value_s, math.hypot(found.sigma_s, _CLOCK_SIGMA_S))
+            self.delay = Delay(value_s, math.hypot(found.sigma_s, CLOCK_S))
 
     def _cost(self, delay_s: float, moved: Displacements, memory: VisualMemory, track: TelemetryTrack) -> float:
         """Negative log-likelihood of displacements, with the residuals' own variance, and of rotations."""
@@ -80,7 +80,7 @@ class DelaySearch:
         scale = float(np.sum(told * seen) / max(float(np.sum(seen**2)), 1e-30))
         residual = told - max(scale, 0.0) * seen
         power = np.sort(np.sum(residual**2, axis=1))[: max(3, int(_KEPT * len(residual)))]
-        sigma = self._config.sigma_velocity_m_s * math.sqrt(0.1 * self._config.interval_s)
+        sigma = VELOCITY_M_S * math.sqrt(0.1 * self._config.interval_s)
         cost = 1.5 * len(residual) * math.log(float(power.mean()) / 3.0 + 0.25 * sigma**2)
         return cost + self._turn_cost(moved, track)
 
@@ -95,7 +95,7 @@ class DelaySearch:
         share = 0.5 * (track.interpolation_variance(moved.from_s) + track.interpolation_variance(moved.to_s))
         squared = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)) ** 2 / share
         kept = np.sort(squared)[: max(3, int(_KEPT * len(trace)))]
-        floor = (0.5 * self._config.sigma_attitude_rad) ** 2
+        floor = (0.5 * ATTITUDE_RAD) ** 2
         return 1.5 * len(trace) * math.log(float(np.mean(kept)) / 3.0 + floor)
 
 

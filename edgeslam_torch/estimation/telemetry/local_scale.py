@@ -13,6 +13,7 @@ from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.scale.joint_scale import displacement_evidence, solved
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements
+from edgeslam_torch.noise import VELOCITY_M_S
 from edgeslam_torch.types import FloatArray, ScaleEstimate
 
 AROUND_S = 5.0
@@ -71,7 +72,7 @@ def scale_of(
     told += turned @ T_b_c[:3, 3]
     moving = np.linalg.norm(told, axis=1) > config.min_speed_m_s * moved.duration_s
     moved, told = moved.only(moving), told[moving]
-    sigma_m = config.sigma_velocity_m_s * np.sqrt(0.1 * moved.duration_s)
+    sigma_m = VELOCITY_M_S * np.sqrt(0.1 * moved.duration_s)
     tilt = config.alignment_sigma_rad
     evidence = displacement_evidence(
         moved.moved @ R_w_m.T, told, moved.from_s, moved.duration_s, moved.sigma, sigma_m, tilt

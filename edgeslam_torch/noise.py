@@ -1,0 +1,93 @@
+"""Noise of every sensor that the estimation reads: standard deviations with unit and source.
+
+The SDK of a Tello sends velocities in whole dm/s, attitude in whole degrees and range in whole centimetres, ten times a
+second. A reading quantised to a step has a standard deviation of the step over the square root of 12.
+"""
+
+import math
+
+# --- velocity ---------------------------------------------------------------------------------------------------------
+
+VELOCITY_SENSOR_M_S = 0.02
+"""Of one reading before quantisation; from residuals of recorded flights."""
+VELOCITY_M_S = 0.033
+"""Of one reading: quantisation to 0.1 m/s, and the sensor."""
+VELOCITY_BIAS_M_S = 0.01
+"""Of a bias common to neighbouring readings, which decays within `VELOCITY_BIAS_MEMORY_S`; from autocorrelation."""
+VELOCITY_BIAS_MEMORY_S = 12.0
+VELOCITY_BIAS_WALK_M_S_SQRT_S = 0.015
+"""Random walk of the filter's bias, before the battery factor."""
+VELOCITY_SCALE_LOG = 0.008
+"""Systematic scale error of the drone's velocity, which averaging does not reduce."""
+VELOCITY_TRUNCATED_SCALE_LOG = 0.015
+"""The same when readings are truncated: the mean remainder depends on an assumed noise."""
+
+# --- attitude ---------------------------------------------------------------------------------------------------------
+
+ATTITUDE_RAD = math.radians(0.36)
+"""Of one reading: 1 deg / sqrt(12) of quantisation, which repeats in hover."""
+ATTITUDE_WALK_RAD_SQRT_S = 0.05
+"""Random walk of the angles between readings; set so that rotation errors match their covariance."""
+UP_RAD = math.radians(2.0)
+"""Of the direction of gravity in one frame: mount, and acceleration taken for gravity."""
+LEVEL_RAD = math.radians(1.0)
+"""Of roll and pitch under acceleration, the mount left out."""
+UP_MEMORY_S = 5.0
+"""Correlation time of both."""
+HEADING_RAD = math.radians(0.5)
+"""Of one heading: quantisation to whole degrees, and the error of the camera mount in a turn."""
+HEADING_DRIFT_RAD_S = math.radians(0.02)
+"""Of the gyroscope's drift rate: a degree per minute."""
+TURN_SHARE = 0.005
+"""Of a rotation, relative: scale factor of the gyroscope, error of the focal length."""
+TILT_RAD = math.radians(2.0)
+"""Of the rotation from map to world, mostly of the camera's mount."""
+
+# --- height -----------------------------------------------------------------------------------------------------------
+
+HEIGHT_M = {"tof": 0.015, "h": 0.06, "baro": 0.15}
+"""Of one reading: range sensor (SDK ``tof``), the SDK's ``h`` in steps of 10 cm, barometer."""
+HEIGHT_STEP_M = {"tof": 0.01, "h": 0.1, "baro": 0.01}
+"""Quantisation of the SDK's heights."""
+HEIGHT_MEMORY_S = 3.0
+"""Correlation time of errors of SDK height and barometer."""
+HEIGHT_SCALE_LOG = 0.02
+"""Systematic scale error of heights over a climb of decimetres, along which the map bends by a centimetre."""
+
+# --- clocks -----------------------------------------------------------------------------------------------------------
+
+STAMP_S = 0.05
+"""Of a message's stamp: half the message interval."""
+CLOCK_S = 0.005
+"""Of an estimated video delay, beside its statistical error."""
+DELAY_S = 0.3
+"""Of an unknown video delay; a Tello's is 0.3 to 0.8 s."""
+
+# --- vision -----------------------------------------------------------------------------------------------------------
+
+VISUAL_DRIFT = 0.01
+"""Drift of the map from frame to frame, as a share of the distance travelled."""
+VISUAL_DRIFT_TURN = 0.003
+"""The same as a share of the angle turned."""
+VISUAL_JITTER_M, VISUAL_JITTER_RAD = 0.002, 0.001
+"""Least noise of a tracked pose."""
+MAP_DRIFT_M, MAP_DRIFT_MEMORY_S = (0.03, 0.002), 4.0
+"""Of the map's local distortion, usual first, of which the residuals choose: the error of a position against those
+seconds before, and its correlation time."""
+MAP_WANDER_LOG = (0.03, 0.09, 0.27, 0.81)
+"""Change of the log of the map's scale per e-fold of its age, usual first, of which the residuals choose: 2 to 14 % in
+the first seconds, later 1 to 2 %; with few features the scale may triple."""
+VISUAL_SIGMA = 0.01
+"""Of a pose without a covariance [map units, rad]."""
+DEPTH_SCALE_LOG = 0.1
+"""Scale error of the depth network common to all keyframes of a scene; the estimated part is added to it."""
+
+# --- motion -----------------------------------------------------------------------------------------------------------
+
+ACCELERATION_M_S2 = 1.0
+ANGULAR_ACCELERATION_RAD_S2 = 1.0
+"""Of a hand or a small drone: constant velocity is off by 20 mm and 20 mrad after 0.2 s."""
+IMPLAUSIBLE_ACCELERATION_M_S2 = 10.0
+"""Per axis, 1 g: a prior that is weak against images; hands and drones have 0.2 to 1.7."""
+POSITION_FLOOR_M_SQRT_S = 1e-3
+"""Minimum process noise of the filter, which keeps the covariance positive definite."""
