@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from edgeslam_torch.estimation.displacement import is_steady
 from edgeslam_torch.estimation.remembered import Remembered
 from edgeslam_torch.estimation.scale.camera_mount import Turned, mount_by_turns
+from edgeslam_torch.estimation.sensors.attitude import is_steady
 from edgeslam_torch.estimation.telemetry.alignment import LATELY, attitudes, map_to_world
 from edgeslam_torch.estimation.telemetry.comparison import MOST_APART_RAD
 from edgeslam_torch.geometry.rotations import rotation_vector

@@ -16,7 +16,14 @@ from edgeslam_torch.estimation.scale.joint_scale import (
     height_evidence,
     solved,
 )
-from edgeslam_torch.estimation.scale.log_scale import LogScale, floor_segments
+from edgeslam_torch.estimation.scale.log_scale import LogScale
+from edgeslam_torch.estimation.sensors.height import floor_segments
+from edgeslam_torch.estimation.sensors.velocity import (
+    Rounding,
+    SeenVelocity,
+    remainder_gain,
+    seen_velocity,
+)
 from edgeslam_torch.estimation.telemetry.comparison import FlightSoFar
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
     AtOdds,
@@ -24,12 +31,6 @@ from edgeslam_torch.estimation.telemetry.sensor_validation import (
     SensorGate,
     agreement,
     changes,
-)
-from edgeslam_torch.estimation.telemetry.velocity_quantisation import (
-    Rounding,
-    SeenVelocity,
-    remainder_gain,
-    seen_velocity,
 )
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements
 from edgeslam_torch.noise import (

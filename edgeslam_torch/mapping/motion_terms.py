@@ -8,7 +8,6 @@ import numpy as np
 
 from edgeslam_torch.estimation.acceleration_prior import inertia
 from edgeslam_torch.estimation.displacement import TelemetryModel
-from edgeslam_torch.estimation.heading import headings
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
 
@@ -78,7 +77,7 @@ def motion_factors(
         if up is not None:
             share = GUESSED if model.holds_level else attitude
             gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(share)))
-        told_yaw = headings(model, stamps)
+        told_yaw = model.headings(stamps)
         if told_yaw is not None:
             poses = order[told_yaw.frame]
             turned.append(HeadingFactor(poses, told_yaw.R_c_m, told_yaw.up_m, attitude * told_yaw.information))

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.displacement import TelemetryModel
-from edgeslam_torch.estimation.heading import headings
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.noise import HEADING_DRIFT_RAD_S, HEADING_RAD, TURN_SHARE
@@ -28,7 +27,7 @@ def flown(rng, motion, keep=lambda sample: True, turn=0.0, **changes):
     model = TelemetryModel(track, FusionConfig(), T_B_C, R_m_w.T, 0.0, 0.0, 1.0, 0.02, True, None, truncates=0.0)
     yaw = Rotation.from_matrix(motion.T_w_c[0, :3, :3] @ T_B_C[:3, :3].T).as_euler("ZYX")[0]
     R_w_c = Rotation.from_euler("z", -yaw).as_matrix() @ motion.T_w_c[chosen, :3, :3]
-    told = headings(replace(model, **changes), motion.stamps_s[chosen])
+    told = replace(model, **changes).headings(motion.stamps_s[chosen])
     return told, np.swapaxes(R_m_w @ R_w_c, 1, 2), motion.stamps_s[chosen]
 
 

@@ -9,7 +9,7 @@ from edgeslam_torch.estimation.scale.joint_scale import (
     height_evidence,
     solved,
 )
-from edgeslam_torch.estimation.scale.log_scale import floor_segments
+from edgeslam_torch.estimation.sensors.height import floor_segments
 from edgeslam_torch.geometry.rotations import matrix_from_rpy
 
 TILT = math.radians(3.0)

@@ -11,7 +11,7 @@ from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.estimation.scale.depth_scale import DepthRatio
 from edgeslam_torch.estimation.scale.log_scale import LogScale
 from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
-from edgeslam_torch.estimation.telemetry.velocity_quantisation import Rounding
+from edgeslam_torch.estimation.sensors.velocity import Rounding
 from edgeslam_torch.estimation.telemetry_scale import TelemetryFit, TelemetryScale
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body

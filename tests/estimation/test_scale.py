@@ -3,7 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from edgeslam_torch.estimation.scale.log_scale import LogScale, floor_segments, fuse
+from edgeslam_torch.estimation.scale.log_scale import LogScale, fuse
+from edgeslam_torch.estimation.sensors.height import floor_segments
 from edgeslam_torch.estimation.telemetry_scale import _by_steps
 from edgeslam_torch.types import Units
 

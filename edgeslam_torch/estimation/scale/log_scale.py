@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.types import FloatArray, IntArray, ScaleEstimate
+from edgeslam_torch.types import ScaleEstimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,19 +20,6 @@ class LogScale:
     log_scale: float
     sigma: float
     source: str
-
-
-def floor_segments(stamp_s: FloatArray, z_m: FloatArray, z_predicted_m: FloatArray, step_m: float) -> IntArray:
-    """Number the segments between floor steps (furniture passing below), shape ``(N,)``.
-
-    A step is a change between neighbours that differs from the predicted change by more than ``step_m``, or a gap of
-    more than half a second.
-    """
-    if len(z_m) == 0:
-        return np.zeros(0, dtype=np.int64)
-    jump = np.abs(np.diff(z_m) - np.diff(z_predicted_m)) > step_m
-    hole = np.diff(stamp_s) > 0.5
-    return np.concatenate([[0], np.cumsum(jump | hole)]).astype(np.int64)
 
 
 def fuse(opinions: Sequence[LogScale]) -> ScaleEstimate:

@@ -7,8 +7,8 @@ import pytest
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.motion import MotionFusion
+from edgeslam_torch.estimation.sensors.velocity import Rounding, remainder, remainder_gain, seen_velocity
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
-from edgeslam_torch.estimation.telemetry.velocity_quantisation import Rounding, remainder, remainder_gain, seen_velocity
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, Sightings
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
