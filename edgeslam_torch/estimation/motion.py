@@ -87,8 +87,8 @@ class MotionFusion:
         self._filter = FilterFeed(config, given)
         self._drift: str | None = None
         """Warning that parts of the map have different scales."""
-        self._fitted_s = -math.inf
-        """Stamp of the last fit."""
+        self._fitted_s = self._remembered_s = -math.inf
+        """Stamps of the last fit, and of the last update of the stored poses to the present map."""
         self._counts: Counter[str] = Counter()
 
     # --- input ---------------------------------------------------------------------------------------------------
@@ -129,6 +129,8 @@ class MotionFusion:
         if self._is_due(stamp_s) or (stamp_s - self._fitted_s >= _FIRST_FIT_S and self.orientation.has_diverged()):
             self._remember_refined(stamp_s, self.config.window_s)
             self._refit()
+        elif self.metres.sensor_scale is not None and stamp_s - self._remembered_s >= _REFIT_S:
+            self._remember_refined(stamp_s, RECKONED_S)
         if self.imu.is_due(stamp_s):
             self._remember_refined(stamp_s, IMU_REACH_S)
             self._fit_imu()
@@ -170,9 +172,9 @@ class MotionFusion:
 
     def _remember_refined(self, stamp_s: float, reach_s: float) -> None:
         """Update the poses of the last seconds to the present map."""
-        if self.refined_poses is None:
-            return
-        self._remember(*self.refined_poses(stamp_s - reach_s))
+        if self.refined_poses is not None:
+            self._remembered_s = stamp_s
+            self._remember(*self.refined_poses(stamp_s - reach_s))
 
     def _remember(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
         self._memory.revise(stamps_s, T_w_c)
