@@ -76,7 +76,8 @@ def _by_height(
 
     None without heights, or after a step of the floor (furniture below) that leaves too few of them.
     """
-    times_s, z = model.track.heights().get(model.height or "", (np.zeros(0), np.zeros(0)))
+    name = model.height or ""
+    times_s, z = model.track.heights().get(name, (np.zeros(0), np.zeros(0)))
     lately = times_s >= stamps_s.min() - _HOLE_S
     times_s, z = times_s[lately], z[lately]
     if len(times_s) == 0 or not (times_s[0] <= frame_s.min() and frame_s.max() <= times_s[-1]):
@@ -89,7 +90,7 @@ def _by_height(
         return None
     then, now = np.interp(stamps_s[use], times_s, z), np.interp(frame_s, times_s, z)
     level = float(now[0] - np.median(then - seen[use]))
-    noise_m = max(_NOISE_M, 3.0 * HEIGHT_M[model.height])
+    noise_m = max(_NOISE_M, 3.0 * HEIGHT_M[name])
     return level, float(noise_m + _unsure(now, np.abs(now[0] - np.median(then)), model.scale_sigma_log))
 
 

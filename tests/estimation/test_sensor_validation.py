@@ -386,21 +386,6 @@ def test_validated_velocities_without_a_scale_are_reported():
     assert any("too badly to tell a scale" in w for w in trust.warnings())
 
 
-def test_heights_beside_velocities_that_leave_much_unexplained_tell_nothing_yet(rng, swinging, replay):
-    """Turned by a tumble they explain a quarter of the motion: is the map wrong, or are they?"""
-    turn = Rotation.from_euler("xyz", [50.0, 0.0, 50.0], degrees=True)
-
-    def spoil(rng, samples, motion):
-        return [replace(s, velocity_m_s=turn.apply(s.velocity_m_s)) for s in samples]
-
-    sigma = []
-    for change in (spoil, lambda rng, samples, motion: samples):
-        motion = swinging(6.0)
-        _, fusion, _ = told_of(np.random.default_rng(0), replay, motion, change)
-        sigma.append({s.source: s.sigma / s.value for s in fusion.metres.sources()}.get("height", math.inf))
-    assert sigma[0] > 2.0 * sigma[1]
-
-
 def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, replay):
     """The depth network confirms the heights: what remains is no surer than heights without any velocities."""
     motion = swinging(18.0, size_m=0.5)

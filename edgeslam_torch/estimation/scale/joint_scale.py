@@ -142,7 +142,8 @@ def displacement_evidence(
     wanders = (MAP_WANDER_LOG[0],) if aged is None else MAP_WANDER_LOG
     possible = [(a, c) for a in MAP_DRIFT_M for c in wanders]
     chosen = possible[0]
-    latent, fit = J, None
+    latent = J
+    fit: _Fit | None = None
     for k in range(5):
         white = (sigma_m**2 + (s * sigma_map) ** 2) / np.maximum(weight, _LEAST_WEIGHT)
         prior = _tilt_prior(s, tilt_sigma_rad)
@@ -228,7 +229,7 @@ def height_evidence(
         wandering = (wander * scale) ** 2 * (risen @ _common(np.interp(t, stamp_s, aged)) @ risen.T)
     prior = _tilt_prior(scale, tilt_sigma_rad, K)
     weight: FloatArray = np.ones(n)
-    fit = None
+    fit: _Fit | None = None
     drift = MAP_DRIFT_M[0]
     for k in range(4):
         white = (sigma_m**2 + (scale * sigma_map) ** 2) / count / np.maximum(weight, _LEAST_WEIGHT)
