@@ -49,7 +49,7 @@ def _gaps(drawn: Drawn) -> Simulated:
     model, readings = simulated(drawn, MPU6050)
     t = readings.stamps_s
     starts = np.linspace(t[0], t[-1], _GAPS + 2)[1:-1]
-    return model, _rows(readings, ~((t[:, None] >= starts) & (t[:, None] < starts + _GAP_S)).any(axis=1))
+    return model, _rows(readings, np.all((t[:, None] < starts) | (t[:, None] >= starts + _GAP_S), axis=1))
 
 
 def _turned(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Drawn], Simulated]:

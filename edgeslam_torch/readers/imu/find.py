@@ -85,8 +85,11 @@ def _read(
         readings, remarks = read_readings(path)
         model = ImuModel(rate_hz=readings.rate_hz, T_imu_cam=_T_KINECT_CAM, time_offset_s=0.0, source=KINECT)
         return model, readings, remarks
-    readings, remarks = (inside, []) if path is None else read_readings(path)
-    assert readings is not None
+    if path is not None:
+        readings, remarks = read_readings(path)
+    else:
+        assert inside is not None
+        readings, remarks = inside, []
     files = [given.model] if given.model is not None else _models(folders)
     files += [given.camera] if given.camera is not None and given.camera.is_file() else []
     is_euroc = path is not None and path.parent.name == EUROC.parent.name

@@ -57,7 +57,7 @@ def read_model(
         sources += [path.name] if new else []
     found = {**(otherwise or {}), **found}
     stated_hz = found.pop("stated_hz", rate_hz)
-    model = ImuModel(**found, rate_hz=rate_hz, source=" and ".join(sources) or ImuModel.source)
+    model = ImuModel(**found, rate_hz=rate_hz, source=" and ".join(sources) or ImuModel().source)
     return model, _assumed(found, stated_hz, rate_hz)
 
 
@@ -74,10 +74,10 @@ def facts(record: dict[str, Any], rate_hz: float) -> dict[str, Any]:
     keys = {_plain(key): value for key, value in _one_imu_one_camera(record)}
     found: dict[str, Any] = {}
     for name, aliases in _DENSITIES.items():
-        sigma = keys.get(_READING_SIGMAS.get(name, ""))
-        density = _first(keys, aliases.split())
-        if density is not None or sigma is not None:
-            found[name] = float(density) if density is not None else float(sigma) / math.sqrt(rate_hz)
+        if (density := _first(keys, aliases.split())) is not None:
+            found[name] = float(density)
+        elif (sigma := keys.get(_READING_SIGMAS.get(name, ""))) is not None:
+            found[name] = float(sigma) / math.sqrt(rate_hz)
     if found and (stated_hz := _first(keys, _RATES)) is not None:  # a file without any of them is a camera's
         found["stated_hz"] = float(stated_hz)
     if (offset := _first(keys, _OFFSETS)) is not None:

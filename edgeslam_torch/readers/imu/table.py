@@ -123,7 +123,7 @@ def _in_m_s2(force: FloatArray) -> tuple[FloatArray, list[str]]:
 
 def _gaps(stamps_s: FloatArray) -> list[str]:
     steps = np.diff(stamps_s)
-    gaps = steps[steps > max(_GAP * np.median(steps), _GAP_S)]
+    gaps = steps[steps > max(_GAP * float(np.median(steps)), _GAP_S)]
     return [f"{len(gaps)} gaps in the readings, up to {gaps.max():.3g} s"] if len(gaps) else []
 
 

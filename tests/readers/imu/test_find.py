@@ -94,7 +94,7 @@ def test_euroc_mount_is_the_relative_pose_of_both_sensors(tmp_path):
 def test_what_is_not_stated_is_said_and_left_to_estimation(tmp_path):
     (tmp_path / "imu.csv").write_text(HEADER + ROWS)
     model, _, said = found(tmp_path)
-    assert model.T_imu_cam is None and model.time_offset_s is None
+    assert model.T_imu_cam is None and model.time_offset_s is None and model.source == ImuModel().source
     assert len(said) == 2 and "noise" in said[0] and "mount and clock" in said[1]
 
 
