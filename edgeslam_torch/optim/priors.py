@@ -46,13 +46,13 @@ class PriorTerms:
         for scale in self.scales:
             r_s, by_i, by_j = scale_prior(T[scale.pose_i], T[scale.pose_j], scale)
             total += r_s**2
-            row = np.zeros(len(g))
+            slope_s = np.zeros(len(g))
             for pose, J in ((scale.pose_i, by_i), (scale.pose_j, by_j)):
                 k = 6 * self.column[pose]
                 if k >= 0:
-                    row[k : k + 6] += J
-            H += np.outer(row, row)
-            g += r_s * row
+                    slope_s[k : k + 6] += J
+            H += np.outer(slope_s, slope_s)
+            g += r_s * slope_s
         return total
 
 

@@ -200,7 +200,7 @@ def _from_columns(table: Table, columns: Columns, path: Path) -> Trajectory:
     poses, time = np.split(numbers, [3 + len(rotation)], axis=1)
     stamps_s, notes = _seconds(time, [unit for _, unit in columns.time])
     stamps_s, poses = _finite(stamps_s, poses, str(path), notes)
-    T = np.tile(np.eye(4), (len(poses), 1, 1))
+    T: FloatArray = np.tile(np.eye(4), (len(poses), 1, 1))
     T[:, :3, 3] = columns.metres * poses[:, :3]
     if rotation:
         norms = np.linalg.norm(poses[:, 3:], axis=1)
