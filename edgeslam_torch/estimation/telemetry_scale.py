@@ -15,6 +15,7 @@ from edgeslam_torch.estimation.scale.joint_scale import (
     displacement_evidence,
     height_evidence,
     solved,
+    turned_since,
 )
 from edgeslam_torch.estimation.scale.log_scale import LogScale
 from edgeslam_torch.estimation.sensors.height import floor_segments
@@ -390,6 +391,9 @@ class TelemetryScale:
                 continue
             tilt = self._tilt_rad
             aged, wander = self._aged(times[here]), MAP_WANDER_LOG[0] if moved is None else moved.wander
+            if moved is None:  # nothing else tells how far the scale of other views differs
+                by_views = np.interp(times[here], stamps_s, turned_since(seen.T)) * (_OF_A_VIEW / wander) ** 2
+                aged = by_views if aged is None else aged + by_views
             evidence = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt, aged, wander)
             if evidence is not None:
                 evidence = evidence.softened(scale * _by_steps(z[here], HEIGHT_STEP_M[name]))

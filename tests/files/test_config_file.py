@@ -120,7 +120,6 @@ FLOATS = [key for key in keys_of(SlamConfig()) if isinstance(attrgetter(key)(Sla
 
 @pytest.mark.parametrize("key", [*FLOATS, "fusion.delay_s", "fusion.delay_range_s"])
 def test_no_number_may_be_infinite_or_none(key):
-    assert len(FLOATS) > 40
     for value in ("nan", "inf", "-inf", "1e999"):
         with pytest.raises(ConfigError, match=key.split(".")[-1]):
             load_config(SlamConfig(), None, [f"{key}=[{value}, 1.0]" if key.endswith("range_s") else f"{key}={value}"])

@@ -39,6 +39,8 @@ _WHEN_TOLD_APART = 2
 """Iteration in which the map's wander is selected: by then the worst outliers are downweighted."""
 _MOST_PARTS = 4
 """Maximum number of parts of a flight whose scales are compared; shorter parts are too noisy."""
+_VIEW_RAD = math.radians(60.0)
+"""Typical field of view."""
 _YOUNG_S = 1.0
 """Lower bound of the map's age."""
 _BIN_S = 0.5
@@ -288,6 +290,13 @@ def _unrest(covariance: FloatArray, fit: "_Fit", J: FloatArray, latent: FloatArr
 def aged_since(stamps_s: FloatArray, began_s: float, now_s: float) -> FloatArray:
     """Log of the map's age now over its age at each stamp ``(N,)``; a map drifts most in its first seconds."""
     return np.asarray(np.log((now_s - began_s + _YOUNG_S) / (np.maximum(stamps_s - began_s, 0.0) + _YOUNG_S)))
+
+
+def turned_since(T: FloatArray) -> FloatArray:
+    """Maximum rotation since each pose ``T`` ``(N, 4, 4)`` relative to the last one, in fields of view ``(N,)``."""
+    cosine = 0.5 * (np.einsum("nij,ij->n", T[:, :3, :3], T[-1, :3, :3]) - 1.0)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return np.asarray(np.maximum.accumulate(angle[::-1])[::-1] / _VIEW_RAD)
 
 
 def _common(aged: FloatArray) -> FloatArray:
