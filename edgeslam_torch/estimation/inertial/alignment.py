@@ -1,6 +1,6 @@
 r"""Scale, gravity, velocities and biases from visual poses beside an IMU: one maximum a posteriori estimate.
 
-Nodes some 0.2 s apart have a rotation, position, velocity and biases of the IMU in metres, in the map's axes; common to
+Nodes some 0.1 s apart have a rotation, position, velocity and biases of the IMU in metres, in the map's axes; common to
 all are the log of metres per map unit, gravity, and the camera on the IMU. Pre-integrated readings relate successive
 nodes (`preintegration`), biases walk, and the poses of the images are observed with an error :math:`e` that is
 correlated in time,
@@ -33,7 +33,7 @@ about a second, the time between keyframes, and hardly beyond."""
 SYSTEMATIC_LOG = 0.01
 """Error of the scale by the accelerometer's gain and axes, which averaging does not reduce: a percent beside the laser
 tracker of a real flight; data sheets allow 3 % (MPU-6050)."""
-LEAST_NODES = 12
+LEAST_NODES = 24
 """Minimum number of nodes, 2.5 s: of fewer, the size of their errors is too uncertain."""
 _STEPS, _METRIC_STEPS = 12, 4
 """Iterations; the first ones linear in the scale itself, whose start is arbitrary."""
@@ -123,7 +123,7 @@ def align(
     """Align visual poses with inertial readings.
 
     Args:
-        stamps_s: Increasing stamps of images ``(N,)``, about 0.2 s apart.
+        stamps_s: Increasing stamps of images ``(N,)``, about 0.1 s apart.
         T_m_c: Their poses ``(N, 4, 4)`` in one submap.
         readings: Readings that cover them, on the IMU's clock.
         model: Noise, and what is known of mount and clock.

@@ -17,8 +17,8 @@ KNOWN_LOG = 0.15
 """Maximum standard deviation of the log of an observable scale: that of the best depth networks."""
 _LEAST_EXCITATION = 3.0
 """Minimum of `Alignment.excitation` of an observable scale."""
-_NODE_S = 0.18
-"""Minimum time between two poses of an alignment: over a tenth of a second their errors hide the motion."""
+_NODE_S = 0.09
+"""Minimum time between two poses of an alignment: those of images are given at 10 Hz."""
 REACH_S = 60.0
 """Length of way that a fit in flight takes: a map's scale drifts over longer ones."""
 _REFIT_S, _REFIT_SHARE = 1.0, 0.12
