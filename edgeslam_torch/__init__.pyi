@@ -2,6 +2,8 @@ from edgeslam_torch.config import SlamConfig as SlamConfig
 from edgeslam_torch.errors import EdgeSlamError as EdgeSlamError
 from edgeslam_torch.geometry.camera import Camera as Camera
 from edgeslam_torch.geometry.camera_file import load_camera as load_camera
+from edgeslam_torch.imu import ImuModel as ImuModel
+from edgeslam_torch.imu import ImuReadings as ImuReadings
 from edgeslam_torch.readers.source import open_source as open_source
 from edgeslam_torch.run import run as run
 from edgeslam_torch.slam import EdgeSlam as EdgeSlam
@@ -15,6 +17,8 @@ __all__ = [
     "EdgeSlam",
     "EdgeSlamError",
     "Frame",
+    "ImuModel",
+    "ImuReadings",
     "SlamConfig",
     "SlamOutput",
     "TelemetrySample",

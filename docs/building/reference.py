@@ -149,7 +149,10 @@ def api_pages() -> dict[str, str]:
     found = {}
     for page, name in PACKAGES.items():
         module = package[name.partition(".")[2]] if "." in name else package
-        exported = [module.members[str(export)] for export in module.exports or () if str(export) != "__version__"]
+        # A package whose ``__all__`` is computed has its public names in its stub.
+        stated = [str(export) for export in module.exports or ()]
+        names = stated or sorted(name for name, member in module.members.items() if member.is_alias)
+        exported = [module.members[name] for name in names if name != "__version__"]
         paths = [member.target_path if member.is_alias else member.path for member in exported]
         found[page] = _api_page(name, module.docstring.value if module.docstring else "", paths)
     for page, names in NAMES.items():

@@ -73,7 +73,7 @@ def flight_process(out, name):
     """Number of the process that works on a flight, once it is in its middle."""
     limit_s = time.monotonic() + 200.0
     while time.monotonic() < limit_s:
-        found = subprocess.run(["pgrep", "-f", f"run_flight {out}/jobs/{name}$"], capture_output=True, text=True)
+        found = subprocess.run(["pgrep", "-f", f"experiment.runner {out}/jobs/{name}$"], capture_output=True, text=True)
         if found.stdout.strip() and (out / "work" / name / "status.csv").is_file():
             return int(found.stdout.split()[0])
     raise AssertionError(f"{name} was not run")

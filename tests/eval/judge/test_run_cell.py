@@ -176,7 +176,7 @@ def test_recording_played_backwards_gets_the_truth_of_each_image_also_where_the_
 
 @pytest.mark.slow
 def test_second_flight_is_in_the_map_of_the_first_and_judged_against_it(recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(run_cell, "HALF", 20)
+    monkeypatch.setitem(run_cell.CASES["second_flight"], "stairs", 20)
     result = run(tmp_path, Cell("stairs/second_flight", 0, str(recording), "second_flight"))
     figures = result["figures"]
     assert figures["frames"] == 16
