@@ -389,8 +389,8 @@ def test_pure_rotation_discards_the_scale_of_a_climb(swinging, replay):
         fusion, gauge, _ = fused(np.random.default_rng(0), motion, informed, TelemetryFaults(video_delay_s=0.0))
         told[turned_rad] = fusion.metres.sensor_scale
     assert told[0.0].source == "height" and told[0.0].sigma < 0.13
-    assert told[0.0].sigma < told[0.5].sigma < told[1.5].sigma < told[3.0].sigma
-    assert told[3.0].sigma > 0.25, "three views away, each of a unit that is .15 another"
+    assert told[0.5].sigma < 1.1 * told[0.0].sigma < told[1.5].sigma < told[3.0].sigma
+    assert told[3.0].sigma > 0.2, "two views beyond the overlap, each of a unit that is .15 another"
 
 
 def test_small_height_changes_give_no_scale(swinging, replay):
