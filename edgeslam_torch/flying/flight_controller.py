@@ -13,7 +13,7 @@ from edgeslam_torch.navigation.drone_state import Contact, DroneState
 from edgeslam_torch.navigation.flight_record import Decision, NewTask
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.navigation.openings.wall_frame import Walls
 from edgeslam_torch.navigation.pilot import Phase, Pilot
@@ -59,7 +59,7 @@ class FlightController:
         self.state: DroneState | None = None
         """Newest state."""
         self.last: Order | None = None
-        self._supervisor = Supervisor(limits)
+        self._supervisor = Supervisor(limits, self.pilot.views)
         self._listeners = list(listeners)
         self._witness = witness
         self._lock = threading.Lock()
@@ -67,7 +67,7 @@ class FlightController:
         self._hold = False
         self._contact: Contact | None = None
         """Contact since the last planning cycle."""
-        self._track: list[FloatArray] = []
+        self._track = Places()
         self._path_m, self._clearance_m = 0.0, math.nan
 
     def begin(self, task: Task) -> None:
@@ -102,8 +102,6 @@ class FlightController:
                 state = replace(state, overridden=True)
         if task is not None:
             self._witness(NewTask(task))
-        if state.map_update is not None:
-            self._carry(state.map_update)
         if contact is not None:
             self._witness(contact)
             self.pilot.add_contact(contact)
@@ -115,12 +113,6 @@ class FlightController:
         self._witness(decision)
         self._note_clearance(state)
         return decision
-
-    def _carry(self, update: MapUpdate) -> None:
-        """Apply a map correction to the path flown; the planner applies it itself."""
-        with self._lock:
-            self._track = list(update.points(np.array(self._track).reshape(-1, 2)))
-            self._supervisor.carry(update)
 
     def _take_up(self, task: Task) -> None:
         """Start a task; a look that is under way is finished first."""
@@ -166,7 +158,7 @@ class FlightController:
     def track(self) -> FloatArray:
         """``(N, 2)`` path flown, oldest first."""
         with self._lock:
-            return np.array(self._track).reshape(-1, 2)
+            return self._track.p_w
 
     def flown(self) -> tuple[float, float]:
         """Path length and minimum clearance of the current task [m]; the clearance is NaN without obstacles."""
@@ -176,10 +168,10 @@ class FlightController:
     def _note_path(self, state: DroneState) -> None:
         here = state.p_w[:2]
         with self._lock:
-            step = float(np.linalg.norm(here - self._track[-1])) if self._track else 0.0
-            if self._track and step < _STEP_M:
+            step = float(np.linalg.norm(here - self._track.last_w)) if len(self._track) else 0.0
+            if len(self._track) and step < _STEP_M:
                 return
-            self._track.append(here.copy())
+            self._track.add(self._supervisor.views, here)
             self._path_m += step
 
     def _note_clearance(self, state: DroneState) -> None:

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
 from edgeslam_torch.navigation.tasks import LooksAhead
 from edgeslam_torch.types import FloatArray
@@ -42,9 +42,6 @@ class Stay(LooksAhead):
         """Always: it is only called at the flight height."""
         return True
 
-    def carry(self, update: MapUpdate) -> None:
-        """Nothing is stored."""
-
 
 @dataclass(slots=True)
 class WayHome:
@@ -55,7 +52,9 @@ class WayHome:
     """
 
     track_w: FloatArray
-    """``(N, 2)`` path flown, oldest first [m]."""
+    """``(N, 2)`` path flown up to the start of the task, oldest first [m]."""
+    _track: Places = field(default_factory=Places)
+    """The same as the map has it now, the take-off first."""
     _looked_s: float = math.inf
     """End of the look with the initial heading."""
     _looks_s: float = math.nan
@@ -66,7 +65,9 @@ class WayHome:
 
     def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
         """Cell of the oldest point of the path inside the grid."""
-        points = np.concatenate([np.zeros((1, 2)), self.track_w])
+        if len(self._track) == 0:
+            self._track.add(state.views, self.track_w, nearest=True)
+        points = np.concatenate([np.zeros((1, 2)), self._track.p_w])
         at = (points - layer.corner_w) / layer.cell_m
         held = ((at >= 1) & (at < np.array(layer.free.shape) - 1)).all(1)
         oldest = points[int(np.argmax(held))] if held.any() else state.p_w[:2]
@@ -102,7 +103,3 @@ class WayHome:
     def faces_rad(self, state: DroneState) -> float | None:
         """The same heading over the last metre."""
         return 0.0 if 0.0 <= state.stamp_s - self._looked_s < _FACES_S else None
-
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction to the path; the take-off stays the origin."""
-        self.track_w = update.points(self.track_w)

@@ -1,11 +1,11 @@
 """Planner input and output: drone state, depth view, contact, velocity command."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import MapUpdate, MapViews
 from edgeslam_torch.types import FloatArray
 
 
@@ -64,6 +64,8 @@ class DroneState:
     """Number of scale revisions so far; positions of different revisions are not comparable."""
     map_update: MapUpdate | None = None
     """Correction of the map since the last state with a view; None if it did not change."""
+    views: MapViews = field(default_factory=MapViews, repr=False, compare=False)
+    """The planner's views of the map, to which positions are tied."""
     overridden: bool = False
     """Whether the supervisor or the operator overrode the last command."""
 

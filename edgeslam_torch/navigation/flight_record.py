@@ -122,8 +122,9 @@ def _entry(value: Any, path: Path, number: int) -> Entry:
 
 def _encoded(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
-        # Internal state starts with an underscore and is rebuilt in a replay.
-        kept = {f.name: _encoded(getattr(value, f.name)) for f in fields(value) if f.init and f.name[0] != "_"}
+        # Internal state starts with an underscore or is left out of comparisons; a replay rebuilds it.
+        recorded = [f.name for f in fields(value) if f.init and f.compare and f.name[0] != "_"]
+        kept = {name: _encoded(getattr(value, name)) for name in recorded}
         return {"kind": f"{type(value).__module__}:{type(value).__name__}", **kept}
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         data = base64.b64encode(zlib.compress(np.ascontiguousarray(value).tobytes(), 1)).decode("ascii")

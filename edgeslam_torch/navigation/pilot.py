@@ -1,7 +1,7 @@
 """Planner: computes velocity commands towards a task's goals through known free space."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -12,7 +12,7 @@ from edgeslam_torch.navigation.contact.losses import Losses
 from edgeslam_torch.navigation.drone_state import HOVER, Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import MapViews, Places
 from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
 from edgeslam_torch.navigation.openings.wall_frame import Walls
 from edgeslam_torch.navigation.route import CostToGo, cost_to_go
@@ -105,8 +105,8 @@ class Pilot:
     """Time of the last state."""
     _least: float = math.inf
     """Lowest cost to go so far; NaN after a map correction."""
-    _progress_w: FloatArray = field(default_factory=lambda: np.zeros(2))
-    """``(2,)`` position at the last progress."""
+    _progress: Places = field(default_factory=lambda: Places(MapViews(), np.zeros(2)))
+    """Position at the last progress."""
     _waiting_s: float = math.nan
     """Since when no free space opens ahead."""
     _revision: int = 0
@@ -118,12 +118,12 @@ class Pilot:
     """Remaining headings of the look, last first."""
     _tries_narrow: bool = True
     """Whether too narrow gaps are still inspected; false after one without success."""
-    _looked_w: FloatArray | None = None
-    """``(2,)`` position of the last look without success."""
+    _looked: Places = field(default_factory=Places)
+    """Position of the last look without success."""
     _looks_again: bool = False
     """Whether the current look repeats one from the same place; it counts as lack of progress."""
-    _doubted_w: FloatArray | None = None
-    """``(2,)`` position at which obstacles were reset last."""
+    _doubted: Places = field(default_factory=Places)
+    """Position at which obstacles were reset last."""
     _losses: Losses = field(default_factory=lambda: Losses(_LOST_M))
     """Tracking losses since the task began."""
     _submap: int = 0
@@ -134,9 +134,14 @@ class Pilot:
     def begin(self, task: Task) -> None:
         """Switch to another task."""
         self.task, self.phase = task, Phase.FLYING
-        self._plan, self._planned_s, self._tries_narrow, self._doubted_w = None, -math.inf, True, None
+        self._plan, self._planned_s, self._tries_narrow, self._doubted = None, -math.inf, True, Places()
         self._progress_s, self._least, self._waiting_s = math.nan, math.inf, math.nan
         self._losses = Losses(_LOST_M)
+
+    @property
+    def views(self) -> MapViews:
+        """Views of the map, to which positions are tied."""
+        return self.space.map_views
 
     def walls(self) -> Walls:
         """Layer at the flight height, and which of its occupied cells are upright."""
@@ -165,6 +170,7 @@ class Pilot:
             raise ValueError("position and velocity must be finite")
         if state.revision != self._revision and state.map_update is None and state.stamp_s - self._revised_s < _MOVES_S:
             return VelocityCommand(why="scale revised: waiting for a view")
+        state = replace(state, views=self.views)
         self._take_in(state)
         looks = self.phase in (Phase.RISING, Phase.SWEEPING, Phase.SINKING)
         if state.overridden or (looks and not self._looks_again):  # that is no lack of progress
@@ -185,8 +191,11 @@ class Pilot:
         return self._at_height(state, self._fly(state))
 
     def _take_in(self, state: DroneState) -> None:
+        corrected = state.map_update is not None
         if state.map_update is not None:
-            self._carry(state.map_update)
+            self.space.correct(state.map_update)
+            self.exits.expire()
+            self._plan, self._least = None, math.nan  # a correction is no progress
         elif state.revision != self._revision:
             self._forget()
         self._revision, self._revised_s = state.revision, state.stamp_s
@@ -203,19 +212,8 @@ class Pilot:
         if self.exits.due(state):
             self.exits.look(self.walls(), state)
             self.task.consider(self.exits.candidates, self.exits.exits)
-
-    def _carry(self, update: MapUpdate) -> None:
-        """Apply a map correction; that is no progress."""
-        self.space.rebuild(update)
-        self.exits.carry(update)
-        self.task.carry(update)
-        self._losses.carry(update)
-        if self._looked_w is not None:
-            self._looked_w = update.points(self._looked_w[None])[0]
-        if self._doubted_w is not None:
-            self._doubted_w = update.points(self._doubted_w[None])[0]
-        self._plan, self._least = None, math.nan
-        self._progress_w = update.points(self._progress_w[None])[0]
+        elif corrected:  # what it was given lies where the map was
+            self.task.consider((), ())
 
     def _check_submap(self, state: DroneState) -> None:
         """Drop views of other submaps if their position relative to this one is too uncertain."""
@@ -224,11 +222,11 @@ class Pilot:
         if state.submap_sigma_m > DEAD_RECKONING_SIGMA_M and self._submap_s > -math.inf:
             self.space.forget_before(self._submap_s)
             self._plan, self._least, self._submap_s = None, math.nan, -math.inf
-            self._looked_w = self._doubted_w = None
+            self._looked, self._doubted = Places(), Places()
 
     def _forget(self) -> None:
         """Reset: the relation of the old scale to the new one is unknown."""
-        self.space, self.exits = Space(), ExitTracker()
+        self.space, self.exits = Space(map_views=self.views), ExitTracker()
         self._plan, self._least, self._progress_s = None, math.inf, math.nan
         self.phase = Phase.RISING
 
@@ -289,13 +287,18 @@ class Pilot:
         now = float(plan.at(here))
         if math.isnan(self._least):
             self._least = now
-        if now < self._least - 0.1 or float(np.linalg.norm(here - self._progress_w)) > _ELSEWHERE_M:
+        if now < self._least - 0.1 or not self._progress.is_near(here, _ELSEWHERE_M):
             self._least, self._progress_s = min(now, self._least), state.stamp_s
-            self._progress_w = here.copy()
+            self._progress = Places(state.views, here)
         elif (stands_s := state.stamp_s - self._progress_s) > _LOST_S:
             self._start_over(state)
             return HOVER
-        elif stands_s > _DITHERS_S and math.isfinite(now) and state.tracked and not _about(self._looked_w, here):
+        elif (
+            stands_s > _DITHERS_S
+            and math.isfinite(now)
+            and state.tracked
+            and not self._looked.is_near(here, _ELSEWHERE_M)
+        ):
             self._rise(state)
             return HOVER
         if not math.isfinite(now):
@@ -373,7 +376,7 @@ class Pilot:
 
     def _may_squeeze(self, here: FloatArray) -> bool:
         """Whether a look from here did not open the path, and unknown cells are not obstacles that were reset."""
-        return _about(self._looked_w, here) and not _about(self._doubted_w, here)
+        return self._looked.is_near(here, _ELSEWHERE_M) and not self._doubted.is_near(here, _ELSEWHERE_M)
 
     def _squeezes(self, arcs: Arcs, state: DroneState) -> np.ndarray:
         """``(C,)`` slow moves with full clearance to obstacles, but only hull distance to unknown cells.
@@ -411,8 +414,8 @@ class Pilot:
     def _rise(self, state: DroneState) -> None:
         """Rise to see the path from above."""
         self.phase, self._waiting_s = Phase.RISING, math.nan
-        self._looks_again = _about(self._looked_w, state.p_w[:2])
-        self._looked_w = state.p_w[:2].copy()
+        self._looks_again = self._looked.is_near(state.p_w[:2], _ELSEWHERE_M)
+        self._looked = Places(state.views, state.p_w[:2])
         self._tries_narrow &= not self._is_narrow(state)
 
     def _start_over(self, state: DroneState) -> None:
@@ -420,12 +423,12 @@ class Pilot:
 
         Reset cells are freed by two views instead of up to ten, so they are not passed at hull distance.
         """
-        if _about(self._doubted_w, state.p_w[:2]) or not state.tracked:
+        if self._doubted.is_near(state.p_w[:2], _ELSEWHERE_M) or not state.tracked:
             self.phase = Phase.STUCK
             return
         self.space.doubt_solids()
         self._plan, self._least, self._progress_s = None, math.inf, state.stamp_s
-        self._doubted_w, self._looked_w = state.p_w[:2].copy(), None
+        self._doubted, self._looked = Places(state.views, state.p_w[:2]), Places()
         self._rise(state)
         self._tries_narrow = True
 
@@ -439,8 +442,3 @@ class Pilot:
         elif state.stamp_s - self._waiting_s > _PATIENCE_S and state.tracked:  # no views come while tracking is lost
             self._rise(state)
         return VelocityCommand(turn_left_rad_s=turn, why="wait for a view of the path")
-
-
-def _about(place_w: FloatArray | None, here: FloatArray) -> bool:
-    """Whether an earlier place ``(2,)`` is close to the current position."""
-    return place_w is not None and float(np.linalg.norm(here - place_w)) < _ELSEWHERE_M

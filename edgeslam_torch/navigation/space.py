@@ -12,7 +12,7 @@ import numpy as np
 
 from edgeslam_torch.navigation.drone_state import Contact, View
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import MapUpdate, MapViews, Places
 from edgeslam_torch.types import FloatArray
 
 CELL_M = 0.1
@@ -36,6 +36,8 @@ _PLACED_M = 0.3
 """Standard deviation of depth [m] above which a ray only frees cells and marks none as occupied."""
 MAX_VIEWS = 240
 """Views stored to rebuild the grid after a map correction: 24 m of flight at top speed."""
+_MAX_FLOWN = 4000
+"""Points of the path flown that are kept: more than four minutes at 15 Hz."""
 _SAME_M, _SAME_COS, _MAX_SAME = 0.1, np.cos(np.radians(4.0)), 3
 """Distance and angle within which views are redundant, and how many of them are stored while hovering."""
 _CONTACT_RAD = np.radians(35.0)
@@ -60,6 +62,8 @@ class Space:
 
     centre_w: FloatArray = field(default_factory=lambda: np.zeros(2))
     floor_m: float = 0.0
+    map_views: MapViews = field(default_factory=MapViews)
+    """Poses of the views that it was shown."""
     _odds: FloatArray = field(init=False)
     """``(SIDE, SIDE, LEVELS)`` log-odds of occupancy."""
     _corner: np.ndarray = field(init=False)
@@ -67,23 +71,25 @@ class Space:
     _views: deque[View] = field(init=False)
     _doubted: int = field(init=False)
     """Number of oldest views that only free cells (`doubt_solids`)."""
-    _flown: deque[tuple[FloatArray, float]] = field(init=False)
+    _flown: Places = field(init=False)
+    _flown_m: list[float] = field(init=False)
+    """Radius around each of these points [m]."""
     _way: np.ndarray = field(init=False)
     """``(SIDE, SIDE)`` uint8, 1 where the drone flew."""
-    _contacts: FloatArray = field(init=False)
-    """``(N, 3)`` points of contact."""
+    _contacts: Places = field(init=False)
 
     def __post_init__(self) -> None:
         self._odds = np.zeros((SIDE, SIDE, LEVELS), np.float32)
         self._corner = np.floor(self.centre_w / CELL_M).astype(int) - SIDE // 2
         self._views = deque(maxlen=MAX_VIEWS)
-        self._flown = deque(maxlen=4000)
+        self._flown, self._flown_m = Places(size=3), []
         self._doubted = 0
         self._way = np.zeros((SIDE, SIDE), np.uint8)
-        self._contacts = np.zeros((0, 3))
+        self._contacts = Places(size=3)
 
     def observe(self, view: View) -> None:
         """Integrate a depth map."""
+        self.map_views.add(view.picture, view.T_w_c)
         small = _smaller(view)
         if len(self._views) >= _MAX_SAME and _same_view(self._views[-_MAX_SAME], small):
             self._views[-1] = small
@@ -95,7 +101,9 @@ class Space:
 
     def flown(self, p_w: FloatArray, radius_m: float) -> None:
         """Mark a sphere around ``(3,)`` as free: the drone's own, or the clear area required at take-off."""
-        self._flown.append((np.array(p_w, dtype=np.float64), radius_m))
+        self._flown.add(self.map_views, p_w)
+        self._flown.keep(slice(-_MAX_FLOWN, None))
+        self._flown_m = [*self._flown_m, radius_m][-_MAX_FLOWN:]
         self._pass(p_w, radius_m)
 
     def was_at(self, p_w: FloatArray) -> np.ndarray:
@@ -109,7 +117,7 @@ class Space:
         """Mark an obstacle ``reach_m`` from the drone's centre permanently as occupied."""
         angle = np.arctan2(contact.towards_w[1], contact.towards_w[0]) + _CONTACT_RAD * np.array([-1.0, 0.0, 1.0])
         level = contact.p_w[:2] + reach_m * np.column_stack([np.cos(angle), np.sin(angle)])
-        self._contacts = np.concatenate([self._contacts, np.column_stack([level, np.full(len(level), contact.p_w[2])])])
+        self._contacts.add(self.map_views, np.column_stack([level, np.full(len(level), contact.p_w[2])]))
 
     def follow(self, p_w: FloatArray) -> None:
         """Shift the grid when the drone ``(3,)`` leaves its centre; cells that fall off are lost."""
@@ -125,16 +133,13 @@ class Space:
             way[new[0], new[1]] = self._way[old[0], old[1]]
         self._odds, self._way, self._corner = moved, way, self._corner + step
 
-    def rebuild(self, update: MapUpdate) -> None:
-        """Rebuild the grid from the stored views after a map correction."""
-        if self._views:
-            poses = update.poses(np.array([view.T_w_c for view in self._views]))
-            for k, (view, T_w_c) in enumerate(zip(self._views, poses, strict=True)):
-                self._views[k] = replace(view, T_w_c=T_w_c, depth_m=update.ratio * view.depth_m)
-        self._contacts = update.points(self._contacts)
-        flown = update.points(np.array([p_w for p_w, _ in self._flown]).reshape(-1, 3))
-        for k, p_w in enumerate(flown):
-            self._flown[k] = p_w, self._flown[k][1]
+    def correct(self, update: MapUpdate) -> None:
+        """Apply a map correction to all that is tied to views, and rebuild the grid from the stored ones."""
+        self.map_views.correct(update)
+        for k, view in enumerate(self._views):
+            T_w_c = self.map_views.pose_of(view.picture)
+            T_w_c = view.T_w_c if T_w_c is None else T_w_c
+            self._views[k] = replace(view, T_w_c=T_w_c, depth_m=update.ratio * view.depth_m)
         self._build()
 
     def forget_before(self, seen_s: float) -> None:
@@ -142,15 +147,15 @@ class Space:
         kept = [view for view in self._views if view.stamp_s >= seen_s]
         self._doubted = max(0, self._doubted - (len(self._views) - len(kept)))
         self._views = deque(kept, maxlen=MAX_VIEWS)
-        self._flown.clear()
-        self._contacts = np.zeros((0, 3))
+        self._flown, self._flown_m = Places(size=3), []
+        self._contacts = Places(size=3)
         self._build()
 
     def _build(self) -> None:
         self._odds[:], self._way[:] = 0.0, 0
         for k, view in enumerate(self._views):
             self._add(view, fills=k >= self._doubted)
-        for p_w, radius_m in self._flown:
+        for p_w, radius_m in zip(self._flown.p_w, self._flown_m, strict=True):
             self._pass(p_w, radius_m)
 
     def doubt_solids(self) -> None:
@@ -166,7 +171,7 @@ class Space:
             raise ValueError(f"a height of {height_m:.2f} m is outside the grid of {LEVELS * CELL_M:.1f} m")
         band = self._odds[:, :, low:high]
         free, solid = np.asarray((band < FREE).all(2)), np.asarray((band > SOLID).any(2))
-        cell = np.floor(self._contacts[:, :2] / CELL_M).astype(int) - self._corner
+        cell = np.floor(self._contacts.p_w[:, :2] / CELL_M).astype(int) - self._corner
         i, j = cell[((cell >= 0) & (cell < SIDE)).all(axis=1)].T
         free[i, j], solid[i, j] = False, True
         return Layer(free, solid, self._corner * CELL_M, CELL_M)

@@ -14,7 +14,7 @@ from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.contact.push import PUSHED_M_S, Push
 from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import MapViews, Places
 from edgeslam_torch.navigation.speed_dither import STEP_M_S, dithered, measurable
 from edgeslam_torch.types import FloatArray
 
@@ -40,7 +40,8 @@ DEAD_RECKONING_SIGMA_M = 0.12
 Enough for the metre of path along which a bare wall fills the view."""
 _WIGGLE_S, _WIGGLE_M_S = 2.0, 0.25
 """Half period and speed of the vertical oscillation that makes the scale observable."""
-_TRAIL_M = 0.05
+_TRAIL_M, _TRAIL_LENGTH = 0.05, 400
+"""Distance between points of the path flown, and how many are kept: 20 m."""
 _ONE_WAY_M = 0.3
 """Tolerance between the paths out and back."""
 _HEIGHT_CONFLICT_M, _HEIGHT_CONFLICT_S = 0.5, 1.0
@@ -94,6 +95,8 @@ class Supervisor:
     """Checks states and commands; call `order` at least every 0.1 s, from a thread of its own."""
 
     limits: NavLimits = field(default_factory=NavLimits)
+    views: MapViews = field(default_factory=MapViews)
+    """The planner's views of the map."""
     landing: bool = False
     """A landing is never aborted."""
     hold: bool = False
@@ -113,10 +116,10 @@ class Supervisor:
     """Since when map height and reported height differ."""
     _sent: bool = True
     """Whether the last order passed the command on, or would have without contact."""
-    _trail: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=400))
-    """Positions flown, `_TRAIL_M` apart."""
+    _trail: Places = field(default_factory=lambda: Places(size=3))
+    """The last positions flown, `_TRAIL_M` apart."""
     _home_w: FloatArray | None = None
-    _known_w: FloatArray | None = None
+    _known: Places = field(default_factory=Places)
     """Last tracked position."""
     _back_s: float = math.nan
     """Duration of backing up."""
@@ -127,21 +130,16 @@ class Supervisor:
         """Set the newest state."""
         self._state = state
         if state.tracked:
-            self._known_w = state.p_w
+            self._known = Places(self.views, state.p_w[:2])
             self._headings.append((state.stamp_s, state.yaw_rad))
             while self._headings[0][0] < state.stamp_s - _BEFORE_S:
                 self._headings.popleft()
         if self._home_w is None:
             self._home_w = state.p_w.copy()
-        moved = not self._trail or float(np.linalg.norm(state.p_w - self._trail[-1])) > _TRAIL_M
+        moved = not len(self._trail) or float(np.linalg.norm(state.p_w - self._trail.last_w)) > _TRAIL_M
         if moved and self._danger(state, state.stamp_s) is Danger.NONE:
-            self._trail.append(state.p_w.copy())
-
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction to the path flown."""
-        self._trail = deque(update.points(np.array(self._trail).reshape(-1, 3)), maxlen=self._trail.maxlen)
-        if self._known_w is not None:
-            self._known_w = update.points(self._known_w[None])[0]
+            self._trail.add(self.views, state.p_w)
+            self._trail.keep(slice(-_TRAIL_LENGTH, None))
 
     def propose(self, command: VelocityCommand, now_s: float) -> None:
         """Set the planner's newest command, valid for `STALE_S`."""
@@ -175,7 +173,7 @@ class Supervisor:
         contact = Contact(self._state.p_w.copy(), self._pushed_w(self._command)) if began else None
         command = self._meanwhile(danger, trouble_s)
         if self._backs_in_vain(command, now_s):
-            self._trail.clear()
+            self._trail.keep(slice(0))
             contact = Contact(self._state.p_w.copy(), self._pushed_w(command))
             command = VelocityCommand(why=f"{danger}: hover")
         return Order(command, home=home, danger=danger, contact=contact)
@@ -199,9 +197,9 @@ class Supervisor:
 
     def _dead_reckoned_m(self) -> float:
         """Distance from the last tracked position [m]."""
-        if self._known_w is None or self._state is None:
+        if len(self._known) == 0 or self._state is None:
             return 0.0
-        return float(np.linalg.norm(self._state.p_w[:2] - self._known_w[:2]))
+        return float(np.linalg.norm(self._state.p_w[:2] - self._known.last_w))
 
     def _danger(self, state: DroneState, now_s: float) -> Danger:
         late = state.blind_s + max(0.0, now_s - state.stamp_s)
@@ -299,13 +297,13 @@ class Supervisor:
         """Velocity back along the path flown."""
         assert self._state is not None
         here = self._state.p_w[:2]
-        away = np.linalg.norm(np.array(self._trail).reshape(-1, 3)[:, :2] - here, axis=1)
-        nearest = _latest_approach(away)
-        while self._trail and (len(self._trail) - 1 > nearest or away[len(self._trail) - 1] < 2 * _TRAIL_M):
-            self._trail.pop()
-        if not self._trail:
+        away = np.linalg.norm(self._trail.p_w[:, :2] - here, axis=1)
+        self._trail.keep(slice(_latest_approach(away) + 1))
+        while len(self._trail) and away[len(self._trail) - 1] < 2 * _TRAIL_M:
+            self._trail.keep(slice(len(self._trail) - 1))
+        if len(self._trail) == 0:
             return VelocityCommand(why=f"{danger}: hover")
-        step = self._trail[-1][:2] - here
+        step = self._trail.last_w[:2] - here
         speed_m_s = dithered(_BACK_M_S + 0.5 * STEP_M_S, trouble_s)
         v_w = measurable(step * (speed_m_s / float(np.linalg.norm(step))))
         c, s = math.cos(self._state.yaw_rad), math.sin(self._state.yaw_rad)

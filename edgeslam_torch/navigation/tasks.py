@@ -13,7 +13,6 @@ from edgeslam_torch.navigation.exploring.around import LooksAround
 from edgeslam_torch.navigation.exploring.frontiers import WIDE_M, Looks, frontiers, reachable
 from edgeslam_torch.navigation.exploring.second_look import SecondLook
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
 from edgeslam_torch.navigation.supervisor import DEAD_RECKONING_SIGMA_M
 from edgeslam_torch.types import FloatArray
@@ -38,9 +37,6 @@ class Task(Protocol):
 
     def gives_up(self, losses: int) -> bool:
         """Whether this many tracking losses at one place end the task."""
-
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction to stored positions."""
 
     def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
         """Receive unconfirmed openings and exits; called before `goals`."""
@@ -109,9 +105,6 @@ class GoTo(LooksAhead):
         """Horizontal distance to the goal [m] by the estimated pose."""
         return float(np.linalg.norm(state.p_w[:2] - self.goal_w[:2]))
 
-    def carry(self, update: MapUpdate) -> None:
-        """No change: the goal is given in metres from the take-off."""
-
 
 def _doubt_m(state: DroneState) -> float:
     """Standard deviation [m] of the position relative to the take-off."""
@@ -144,7 +137,7 @@ class Explore:
         found = np.concatenate([borders[wide], self._around.goals(layer, state), self._second.goals(layer, state)])
         if len(found):
             return self._goes_on(found)
-        self._second.once_more(state.stamp_s)
+        self._second.once_more(state)
         again = self._second.goals(layer, state)
         return np.concatenate([borders, self._goes_on(again)])
 
@@ -157,12 +150,6 @@ class Explore:
     def done(self, state: DroneState) -> bool:
         """Whether the time is over or nothing is left to explore."""
         return state.stamp_s >= self.until_s or self._looks.over(state.stamp_s)
-
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction to stored positions."""
-        self._looks.carry(update)
-        self._around.carry(update)
-        self._second.carry(update)
 
     def gives_up(self, losses: int) -> bool:
         """Never: other places are left, and time is limited."""

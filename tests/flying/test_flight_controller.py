@@ -1,16 +1,14 @@
 """Pilot and supervisor together: what counts for a verb, and who may wait for whom."""
 
 import threading
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from views import longer
 
 from edgeslam_torch.flying.flight_controller import FlightController
-from edgeslam_torch.flying.tasks import Stay
 from edgeslam_torch.navigation.drone_state import DroneState, VelocityCommand
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.navigation.pilot import Phase
 from edgeslam_torch.navigation.supervisor import Danger
 
@@ -94,10 +92,7 @@ def test_way_is_counted_for_each_task_and_the_track_for_the_flight(flight_contro
     assert flight_controller.flown()[0] == 0.0
     assert len(flight_controller.track()) > 5 and flight_controller.track()[0] == pytest.approx([0.0, 0.0])
     length = flight_controller.track()[-1][0]
-    here = np.eye(4)[None]
-    flight_controller.pilot.task = Stay()
-    flight_controller.begin(Stay())
-    flight_controller.plan(replace(state(2.0, 0.5), revision=1, map_update=MapUpdate(here, here, 1.5)))
+    flight_controller._supervisor.views.correct(longer(1.5))
     assert flight_controller.track()[-1] == pytest.approx([1.5 * length, 0.0]), "longer metres, a longer track"
 
 

@@ -4,10 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from views import moved
 
 from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import MapViews
 from edgeslam_torch.navigation.openings.aperture_hypotheses import aperture_hypotheses
 from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
 from edgeslam_torch.navigation.openings.wall_frame import Walls, along_walls
@@ -113,13 +114,14 @@ def test_two_hypotheses_make_a_candidate_but_no_exit():
 
 
 def test_hypotheses_follow_map_corrections():
-    watch, T = ExitTracker(), looking(0.5, 0.0, 0.0)
+    watch, T, views = ExitTracker(), looking(0.5, 0.0, 0.0), MapViews()
+    views.add(0, np.eye(4))
     for k in range(3):
-        here = np.array([0.5, 0.0, HEIGHT_M])
-        watch.look(walls(), DroneState(0.5 * k, here, 0.0, np.zeros(3), view=picture(T, (-0.45, 0.45), 2.0)))
+        here, view = np.array([0.5, 0.0, HEIGHT_M]), picture(T, (-0.45, 0.45), 2.0)
+        watch.look(walls(), DroneState(0.5 * k, here, 0.0, np.zeros(3), view=view, views=views))
     away = np.eye(4)
     away[1, 3] = 1.0
-    watch.carry(MapUpdate(np.eye(4)[None], away[None]))
+    views.correct(moved(0, away))
     watch.look(walls((0.55, 1.45)), DroneState(2.0, np.array([0.5, 1.0, HEIGHT_M]), 0.0, np.zeros(3)))
     (candidate,) = watch.candidates
     assert candidate.centre_w == pytest.approx([2.0, 1.0], abs=0.12)

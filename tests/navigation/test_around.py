@@ -4,16 +4,21 @@ import math
 
 import numpy as np
 import pytest
+from views import longer
 
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.around import LooksAround, _in_turn
 from edgeslam_torch.navigation.exploring.coverage import Borders
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import MapViews
 
 
 def at(now_s, x, yaw_deg, tracked=True):
-    return DroneState(now_s, np.array([x, 0.0, 1.15]), math.radians(yaw_deg), np.zeros(3), tracked=tracked)
+    here = np.array([x, 0.0, 1.15])
+    return DroneState(now_s, here, math.radians(yaw_deg), np.zeros(3), tracked=tracked, views=VIEWS)
+
+
+VIEWS = MapViews()
 
 
 def corridor(long_m=6.0):
@@ -113,7 +118,7 @@ def test_positions_follow_map_corrections():
     """Metres become twice as long: where it has looked around, 2 m from its take-off, is 4 m from it."""
     looks = LooksAround()
     assert looked(looks, 2.0)
-    looks.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None], 2.0))
+    VIEWS.correct(longer(2.0))
     assert not looked(looks, 4.1, begin_s=30.0)
     assert looked(looks, 2.0, begin_s=60.0)
 

@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from views import moved
 
 from edgeslam_torch.navigation.corridor.corridor_geometry import mouths
 from edgeslam_torch.navigation.corridor.follow import FollowCorridor
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import MapViews
 from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
 
 
@@ -332,15 +333,16 @@ def test_space_before_the_wall_is_no_continuation():
 
 def test_it_moves_with_the_map():
     """Two metres to the left: the way flown stays the way flown, and what turns off what it flies to."""
-    from_, to = np.eye(4)[None], np.eye(4)[None]
-    to[0, 1, 3] = 2.0
+    to = np.eye(4)
+    to[1, 3] = 2.0
     for shape, left_m in ((stub, 3.6), (sides(end=3.0), math.nan)):
-        task = FollowCorridor()
+        task, views = FollowCorridor(), MapViews()
+        views.add(0, np.eye(4))
         for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-            task.goals(seen(shape), state(x, 0.0, 0.5 * k))
-        task.carry(MapUpdate(from_, to))
-        moved = seen(lambda x, y: shape(x, y - 2.0))  # noqa: B023
-        found = moved.centres(task.goals(moved, state(2.4, 2.0, 30.0)))
+            task.goals(seen(shape), replace(state(x, 0.0, 0.5 * k), views=views))
+        views.correct(moved(0, to))
+        there = seen(lambda x, y: shape(x, y - 2.0))  # noqa: B023
+        found = there.centres(task.goals(there, state(2.4, 2.0, 30.0)))
         assert (found[:, 1] > left_m).all() if math.isfinite(left_m) else len(found) == 0
 
 

@@ -1,14 +1,16 @@
 """Coverage of borders by frontal views."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from views import longer
 
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.coverage import Borders, Coverage, borders
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import MapViews
 
 WALL = Borders(np.array([[x, 1.0] for x in np.arange(-3.0, 3.05, 0.1)]), np.tile([0.0, -1.0], (61, 1)), 0.1)
 """One metre to the left of a drone that flies along x."""
@@ -57,15 +59,16 @@ def test_views_accumulate_without_duplicates():
     for x in (-0.6, 0.0, 0.05, 0.6):
         for yaw in (88.0, 91.0):
             coverage.note(at(x, 0.0, yaw))
-    assert len(coverage._views) == 3
+    assert len(coverage._places) == 3
     assert np.abs(coverage.unlooked(WALL).p_w[:, 0]).min() > 0.9
 
 
 def test_views_follow_map_corrections():
     """Metres become twice as long: what was seen 2 m away is 1 m away."""
     coverage = Coverage()
-    coverage.note(at(2.0, 0.0, 90.0))
-    coverage.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None], 0.5))
+    views = MapViews()
+    coverage.note(replace(at(2.0, 0.0, 90.0), views=views))
+    views.correct(longer(0.5))
     left = coverage.unlooked(WALL).p_w[:, 0]
     assert not ((left > 0.7) & (left < 1.3)).any()
 

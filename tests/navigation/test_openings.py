@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from views import longer, moved
 
 from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.navigation.exploring.frontiers import Looks, reachable
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import MapUpdate, MapViews
 from edgeslam_torch.navigation.openings.detour import has_detour
 from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
 from edgeslam_torch.navigation.openings.exits import distinct, openings
@@ -123,10 +124,10 @@ def state(x, y=0.0, stamp_s=0.0, yaw=0.0, **fields):
     return DroneState(stamp_s, np.array([x, y, 1.15]), yaw, np.zeros(3), **fields)
 
 
-def watched(places, walls):
+def watched(places, walls, views=None):
     watch = ExitTracker()
     for k, x in enumerate(places):
-        watch.look(walls, state(x, stamp_s=0.5 * k))
+        watch.look(walls, state(x, stamp_s=0.5 * k, views=views or MapViews()))
     return watch
 
 
@@ -232,7 +233,7 @@ def test_a_jump_of_the_pose_is_no_way_through():
         watch.look(surroundings(wall(0.9)), state(x, 0.0, 3.0 + 0.5 * k))
     assert not any(seen.flown for seen in watch._seen)
     watch.look(surroundings(wall(0.9)), state(2.6, 0.0, 4.5))
-    watch.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None]))
+    watch.expire()
     watch.look(surroundings(wall(0.9)), state(1.8, 0.0, 5.0))
     assert not any(seen.flown for seen in watch._seen), "nor is a map that moved"
 
@@ -406,13 +407,14 @@ def test_upright_is_what_fills_the_height():
 
 def test_an_exit_stays_where_its_pictures_stay():
     """A misplaced submap that overlaps the door must not move it when corrected."""
-    walls, watch = surroundings(wall(0.9)), ExitTracker()
+    walls, watch, views = surroundings(wall(0.9)), ExitTracker(), MapViews()
     for k, x in enumerate([0.0, 0.2, 0.4, 0.6]):
-        view = View(0.5 * k, np.zeros((2, 2)), np.zeros((2, 2)), np.eye(3), np.eye(4), picture=10 + k)
-        watch.look(walls, state(x, stamp_s=0.5 * k, view=view))
-    before, after = np.stack([np.eye(4)] * 2), np.stack([np.eye(4)] * 2)
-    before[1, 0, 3], after[1, 0, 3] = 2.0, 3.0
-    watch.carry(MapUpdate(before, after, pictures=np.array([10, 90])))
+        views.add(10 + k, np.eye(4))
+        watch.look(walls, state(x, stamp_s=0.5 * k, views=views))
+    across, away = np.eye(4), np.eye(4)
+    across[0, 3], away[0, 3] = 2.0, 3.0
+    views.add(90, across)
+    views.correct(MapUpdate(np.array([10, 90]), np.stack([np.eye(4), away])))
     unseen = surroundings(lambda a, b: np.zeros(a.shape, bool), lambda a, b: np.ones(a.shape, bool))
     watch.look(unseen, state(0.0, stamp_s=3.0, yaw=-2.0))
     assert [e.centre_w[:2] for e in watch.exits] == [pytest.approx([2.0, 0.0], abs=0.15)]
@@ -420,10 +422,11 @@ def test_an_exit_stays_where_its_pictures_stay():
 
 def test_exits_go_along_with_the_map():
     """Its metres become twice as long and the map turns square to the left about the origin."""
-    watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
-    before = np.eye(4)[None]
-    after = np.array([[[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]])
-    watch.carry(MapUpdate(before, after, 1.3))
+    views = MapViews()
+    views.add(0, np.eye(4))
+    watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)), views)
+    after = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    views.correct(moved(0, after, 1.3))
     unseen = surroundings(lambda a, b: np.zeros(a.shape, bool), lambda a, b: np.ones(a.shape, bool))
     watch.look(unseen, state(0.0, stamp_s=3.0, yaw=-2.0))
     (exit_,) = watch.exits
@@ -445,11 +448,10 @@ def test_a_revised_unit_forgets_exits_if_no_view_says_where_they_went():
 
 def test_a_revised_unit_keeps_exits_that_a_view_carries_along():
     pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
-    pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
+    pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)), pilot.views)
     pilot.update(state(0.0, stamp_s=9.0))
     assert len(pilot.exits.exits) == 1
-    here = np.eye(4)[None]
-    pilot.update(replace(state(0.0, stamp_s=9.1, yaw=2.0), revision=1, map_update=MapUpdate(here, here, 1.2)))
+    pilot.update(replace(state(0.0, stamp_s=9.1, yaw=2.0), revision=1, map_update=longer(1.2)))
     pilot.update(replace(state(0.0, stamp_s=9.7, yaw=2.0, view=VIEW), revision=1))
     assert [e.centre_w[0] for e in pilot.exits.exits] == [pytest.approx(2.4, abs=0.15)]
 

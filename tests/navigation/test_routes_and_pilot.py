@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from views import facing_a_wall
+from views import facing_a_wall, moved
 
 from edgeslam_torch.drone.emulator.drone import DroneModel
 from edgeslam_torch.flying.tasks import WayHome
@@ -14,7 +14,7 @@ from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityC
 from edgeslam_torch.navigation.exploring.frontiers import frontiers
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.pilot import Phase, Pilot
 from edgeslam_torch.navigation.route import cost_to_go
 from edgeslam_torch.navigation.tasks import Explore, GoTo
@@ -338,7 +338,7 @@ def test_obstacles_are_reset_once_before_giving_up():
 def test_reset_obstacles_keep_full_clearance():
     pilot = before_a_strip()
     assert after_looking(pilot).forward_m_s > 0.1
-    pilot._doubted_w = np.array([0.3, 0.05])
+    pilot._doubted = Places(pilot.views, [0.3, 0.05])
     assert pilot.update(replace(at(0.3, 0.05), stamp_s=9.0)).forward_m_s < 0.01
 
 
@@ -360,17 +360,15 @@ def test_map_correction_is_no_progress():
     """To and fro by a decimetre, twice a second: what was free and solid goes along, and the way stays closed."""
     pilot = before_a_free_way()
     closed(pilot)
-    before = np.eye(4)
-    before[2, 3] = 1.15
+    pilot.views.add(99, np.eye(4))
+    after = np.eye(4)
+    after[2, 3] = 1.15
     for k in range(36):
-        after = before.copy()
         after[0, 3] = 0.1 * (k % 2 == 0)
-        update = MapUpdate(before[None], after[None])
-        before = after
-        pilot.update(replace(at(after[0, 3], 0.0, stamp_s=0.5 * k), map_update=update if k else None))
+        pilot.update(replace(at(after[0, 3], 0.0, stamp_s=0.5 * k), map_update=moved(99, after.copy()) if k else None))
         if pilot.phase is Phase.RISING:
             pilot.phase = Phase.FLYING
-    assert pilot._doubted_w is not None
+    assert len(pilot._doubted)
 
 
 @pytest.mark.parametrize(("apart_m", "forgotten"), [(0.1, False), (0.13, True)])

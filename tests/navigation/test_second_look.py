@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from views import longer
 
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.second_look import SecondLook
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import MapViews
 from edgeslam_torch.navigation.openings.exit_tracker import Candidate
 from edgeslam_torch.navigation.tasks import Explore
 
@@ -16,8 +17,11 @@ DOOR = Candidate(np.array([3.0, 0.0]), np.array([1.0, 0.0]), np.array([1.5, 1.0]
 """In a wall across x, seen from its left half."""
 
 
+VIEWS = MapViews()
+
+
 def at(x, y, now_s=0.0):
-    return DroneState(now_s, np.array([x, y, 1.15]), 0.0, np.zeros(3))
+    return DroneState(now_s, np.array([x, y, 1.15]), 0.0, np.zeros(3), views=VIEWS)
 
 
 def room(solid=None):
@@ -92,7 +96,8 @@ def test_looks_follow_map_corrections():
     """Metres become twice as long: what was given up at 3 m is at 6."""
     look = considering(DOOR)
     look.heading_rad(at(1.8, -0.3, 0.0))
-    look.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None], 2.0))
+    VIEWS.correct(longer(2.0))
+    look.consider(())
     assert look.heading_rad(at(1.8, -0.3, 5.0)) is None, "what it was told lay where the map was"
     look.consider([Candidate(np.array([6.0, 0.0]), DOOR.normal_w, np.array([3.0, 2.0]))])
     assert look.heading_rad(at(5.0, 0.0, 5.0)) is None
@@ -112,7 +117,7 @@ def test_hypothesis_may_be_viewed_from_its_first_viewpoint():
 def test_unconfirmed_candidate_gets_two_more_looks():
     look, stood = considering(DOOR), []
     for k in range(4):
-        look.once_more(10.0 * k)
+        look.once_more(at(0.0, 0.0, 10.0 * k))
         places = wanted(look, room(), now_s=10.0 * k)
         if k == 3:
             assert len(places) == 0, "three times in all"
@@ -120,7 +125,7 @@ def test_unconfirmed_candidate_gets_two_more_looks():
         assert all(np.linalg.norm(places - place, axis=1).min() > 0.3 for place in stood)
         stood.append(places[0])
         assert look.heading_rad(at(*places[0], 10.0 * k)) is not None
-        look.once_more(10.0 * k + 3.9)
+        look.once_more(at(0.0, 0.0, 10.0 * k + 3.9))
         assert look.heading_rad(at(*places[0], 10.0 * k + 4.1)) is None
     assert len(stood) == 3
 
@@ -128,7 +133,7 @@ def test_unconfirmed_candidate_gets_two_more_looks():
 def test_unreached_candidate_is_not_retried():
     look = considering(DOOR)
     assert len(wanted(look, room(), now_s=0.0))
-    look.once_more(31.0)
+    look.once_more(at(0.0, 0.0, 31.0))
     assert len(wanted(look, room(), now_s=31.0)) == 0
 
 

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from views import K, facing_a_wall
+from views import K, facing_a_wall, longer, moved
 
 from edgeslam_torch.navigation.drone_state import Contact
-from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.navigation.space import Space
 
 
@@ -113,7 +112,7 @@ def test_path_flown_is_free():
 def test_grid_follows_map_corrections():
     space = Space()
     seen(space)
-    space.rebuild(MapUpdate(facing_a_wall().T_w_c[None], facing_a_wall(x=1.0).T_w_c[None]))
+    space.correct(moved(0, facing_a_wall(x=1.0).T_w_c))
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 2.55, 0.05) == (True, False)
     assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
@@ -125,8 +124,7 @@ def test_grid_follows_scale_changes():
     space = Space()
     seen(space)
     space.flown(np.array([0.0, 1.0, 1.15]), 0.2)
-    here = facing_a_wall().T_w_c[None]
-    space.rebuild(MapUpdate(here, here, 1.5))
+    space.correct(moved(0, facing_a_wall().T_w_c, 1.5))
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 2.55, 0.05) == (True, False)
     assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
@@ -137,26 +135,25 @@ def test_grid_follows_scale_changes():
 def test_redundant_views_are_dropped():
     space = Space()
     for k in range(300):
-        space.observe(facing_a_wall(x=0.01 * min(k, 100)))
-    here = np.array([facing_a_wall(x=x).T_w_c for x in (0.0, 1.0)])
-    space.rebuild(MapUpdate(here, here))
+        space.observe(facing_a_wall(x=0.01 * min(k, 100), picture=k))
+    space.correct(longer(1.0))
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 0.75, 0.05) == (True, False) and cell(layer, 1.55, 0.05) == (True, False)
 
 
 def test_reset_wall_stays_unknown_until_observed_again():
     """The space in front stays free, the wall is not freed."""
-    space, update = Space(), MapUpdate(facing_a_wall().T_w_c[None], facing_a_wall(x=1.0).T_w_c[None])
+    space, there = Space(), facing_a_wall(x=1.0).T_w_c
     seen(space)
     space.doubt_solids()
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 1.55, 0.05) == (True, False) and not layer.solid.any() and not cell(layer, 2.05, 0.05)[0]
-    space.rebuild(update)
+    space.correct(moved(0, there))
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 2.55, 0.05) == (True, False) and not layer.solid.any()
-    layer = seen(space, x=1.0)
+    layer = seen(space, x=1.0, picture=1)
     assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
-    space.rebuild(MapUpdate(update.after_w, update.after_w))
+    space.correct(longer(1.0))
     assert space.layer(1.15, 0.15).solid.any(), "what was seen again stays"
 
 
@@ -211,12 +208,11 @@ def test_contact_stays_occupied():
 
 
 def test_contacts_follow_map_corrections():
-    space = Space()
+    space, shifted = Space(), np.eye(4)
+    space.map_views.add(0, np.eye(4))
     space.add_contact(Contact(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
-    T = np.eye(4)[None]
-    shifted = T.copy()
-    shifted[0, :3, 3] = [1.0, 2.0, 0.0]
-    space.rebuild(MapUpdate(T, shifted, 1.0))
+    shifted[:3, 3] = [1.0, 2.0, 0.0]
+    space.correct(moved(0, shifted))
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 2.22, 2.05)[1] and not cell(layer, 1.22, 0.05)[1]
 
@@ -236,7 +232,7 @@ def test_path_flown_follows_grid_and_map():
     assert space.was_at(places).tolist() == [True, True, False, False]
     space.follow(np.array([3.0, 0.0, 1.15]))
     assert space.was_at(places).tolist() == [True, True, False, False]
-    space.rebuild(MapUpdate(np.eye(4)[None], np.eye(4)[None], 2.0))
+    space.correct(longer(2.0))
     assert space.was_at(places).tolist() == [True, False, True, True]
     assert not space.was_at(np.array([50.0, 0.0]))
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from views import longer
 
 from edgeslam_torch.navigation.drone_state import DroneState, VelocityCommand
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.navigation.supervisor import LAND_S, UNSURE_LAND_S, Danger, Supervisor
 
 AHEAD = VelocityCommand(forward_m_s=0.5, why="ahead")
@@ -333,7 +333,7 @@ def test_scale_change_is_no_dead_reckoned_distance():
     supervisor = Supervisor()
     flown(supervisor, 2.0)
     flown(supervisor, 1.0, lambda s: replace(s, tracked=False, position_sigma_m=0.1), begin_s=2.0, x=1.0)
-    supervisor.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None], 2.0))
+    supervisor.views.correct(longer(2.0))
     there = {"p_w": np.array([2.95, 0.0, 2.2]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
     lost = flown(supervisor, 11.0, lambda s: replace(s, **there), command=VelocityCommand(), begin_s=3.0)
     backing = [o.command.why.endswith("back up along the path flown") for o in lost]
@@ -344,8 +344,7 @@ def test_way_back_follows_map_corrections():
     """Metres become twice as long: the drone that was 1.5 m from its start is 3 m away, and backs up."""
     supervisor = Supervisor()
     flown(supervisor, 3.0)
-    here = np.eye(4)[None]
-    supervisor.carry(MapUpdate(here, here, 2.0))
+    supervisor.views.correct(longer(2.0))
     blind = flown(
         supervisor,
         4.0,

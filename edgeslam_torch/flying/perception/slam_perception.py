@@ -1,7 +1,6 @@
 """Perception by SLAM from frames and state messages."""
 
 import threading
-from collections import deque
 
 import cv2
 import numpy as np
@@ -15,7 +14,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.drone_state import DroneState, View
-from edgeslam_torch.navigation.map_update import MapUpdate, moves
+from edgeslam_torch.navigation.map_views import MapUpdate, moves
 from edgeslam_torch.navigation.near.depth import NearFit, fit_to_points
 from edgeslam_torch.navigation.near.depth_bias import DepthBias
 from edgeslam_torch.navigation.near.points import agreeing, seen_points, with_nearer_points
@@ -98,10 +97,8 @@ class SlamPerception:
         """Metres per map unit in use; NaN while the scale is unknown."""
         self._shown: tuple[FloatArray, float, int] = np.zeros((0, 4, 4)), 1.0, 0
         """At the last view: poses ``(F, 4, 4)`` of all frames, metres per map unit, and the revision."""
-        self._thinned_views: list[tuple[int, FloatArray]] = []
-        """One in `_THINNED` of the views that the planner has dropped, for corrections of what was detected in them."""
-        self._sent_views: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_VIEWS)
-        """Frames whose views the planner has, with their poses as last sent."""
+        self._sent_views: list[tuple[int, FloatArray]] = []
+        """Frames whose views were sent to the planner, the newest of them with their poses as last sent."""
         self._sent_unit, self._sent_revision, self._moved_s = 1.0, 0, -np.inf
         self._revision = 0
 
@@ -213,22 +210,15 @@ class SlamPerception:
             if view.picture < first:  # of a map that was replaced meanwhile
                 return None
             found = None
-            if self._sent_views:
-                sent = [*self._thinned_views, *self._sent_views]
-                pictures, before = np.array([picture for picture, _ in sent]), np.array([T for _, T in sent])
-                after, kept = T_w_c[pictures - first], slice(len(self._thinned_views), None)
-                revised = revision != self._sent_revision
-                if revised or (
-                    view.stamp_s - self._moved_s > _MOVES_EVERY_S and moves(before[kept], after[kept], CELL_M)
-                ):
-                    found, self._moved_s = MapUpdate(before, after, unit / self._sent_unit, pictures), view.stamp_s
-                    sent = list(zip(pictures.tolist(), after, strict=True))
-                    self._thinned_views, self._sent_views = (
-                        sent[: kept.start],
-                        deque(sent[kept], self._sent_views.maxlen),
-                    )
-            if len(self._sent_views) == MAX_VIEWS and self._sent_views[0][0] % (_THINNED * _DEPTH_EVERY) < _DEPTH_EVERY:
-                self._thinned_views.append(self._sent_views[0])
+            if recent := self._sent_views[-MAX_VIEWS:]:
+                sent = [*self._sent_views[:-MAX_VIEWS:_THINNED], *recent]
+                pictures, before = np.array([picture for picture, _ in sent]), np.array([T for _, T in recent])
+                T_w_c = T_w_c[pictures - first]
+                after = T_w_c[-len(recent) :]
+                late = view.stamp_s - self._moved_s > _MOVES_EVERY_S
+                if revision != self._sent_revision or (late and moves(before, after, CELL_M)):
+                    found, self._moved_s = MapUpdate(pictures, T_w_c, unit / self._sent_unit), view.stamp_s
+                    self._sent_views[-len(recent) :] = zip(pictures[-len(recent) :].tolist(), after, strict=True)
             self._sent_views.append((view.picture, view.T_w_c))
             self._sent_unit, self._sent_revision = unit, revision
         return found

@@ -1,12 +1,11 @@
 """Counter of tracking losses at one place: a textureless view fails repeatedly."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from edgeslam_torch.navigation.drone_state import DroneState
-from edgeslam_torch.navigation.map_update import MapUpdate
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.navigation.map_views import Places
 
 
 @dataclass(slots=True)
@@ -20,8 +19,8 @@ class Losses:
     about_m: float
     count: int = 0
     """Losses at the current place."""
-    _place_w: FloatArray | None = None
-    """``(2,)`` position of the first loss."""
+    _place: Places = field(default_factory=Places)
+    """Position of the first loss."""
     _lost: bool = False
 
     def note(self, state: DroneState) -> None:
@@ -31,11 +30,6 @@ class Losses:
         elif state.overridden and not self._lost:
             self._lost = True
             here = state.p_w[:2]
-            if self._place_w is None or float(np.linalg.norm(here - self._place_w)) > self.about_m:
-                self._place_w, self.count = here.copy(), 0
+            if len(self._place) == 0 or float(np.linalg.norm(here - self._place.last_w)) > self.about_m:
+                self._place, self.count = Places(state.views, [here]), 0
             self.count += 1
-
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction."""
-        if self._place_w is not None:
-            self._place_w = update.points(self._place_w[None])[0]

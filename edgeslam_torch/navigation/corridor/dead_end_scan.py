@@ -9,7 +9,7 @@ from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.corridor.corridor_geometry import unknown_sides
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.types import FloatArray
 
 _BACK_M = 2.2
@@ -32,8 +32,8 @@ _ABOUT_M = 1.0
 class DeadEndScan:
     """A full turn at the end, a look to each side without a known wall from farther back, and the return to the end."""
 
-    end_w: FloatArray
-    """``(2,)`` apparent end of the corridor."""
+    end: Places
+    """Apparent end of the corridor, one point."""
     axis: FloatArray
     """``(2,)`` unit vector of its direction there."""
     over: bool = False
@@ -48,6 +48,11 @@ class DeadEndScan:
     """Start of the current leg."""
     _turns_s: float = math.nan
     """Start of the full turn."""
+
+    @property
+    def end_w(self) -> FloatArray:
+        """``(2,)`` where the end is now."""
+        return self.end.last_w
 
     def goal(self, layer: Layer, state: DroneState) -> FloatArray | None:
         """Goal ``(2,)``; None during the full turn and when the scan is over."""
@@ -95,10 +100,6 @@ class DeadEndScan:
             self._headings.pop()
             self._reached_s = state.stamp_s
         return self._headings[-1] if self._headings else None
-
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction."""
-        self.end_w = update.points(self.end_w[None])[0]
 
 
 def _away(state: DroneState, place_w: FloatArray) -> float:

@@ -21,7 +21,7 @@ from edgeslam_torch.navigation.corridor.trail import PASSED_M, Trail, aside
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.frontiers import Looks
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
 from edgeslam_torch.navigation.tasks import LooksAhead
@@ -57,8 +57,8 @@ class FollowCorridor(LooksAhead):
     _losses: Losses = field(default_factory=lambda: Losses(math.inf))
     """Tracking losses at the apparent end."""
     _wide_s: float = math.nan
-    _target_w: FloatArray | None = None
-    """``(2,)`` current goal in a corridor that turns off."""
+    _target: Places = field(default_factory=Places)
+    """Current goal in a corridor that turns off."""
     _doors: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
     """``(2,)`` centre and unit normal of each exit."""
     _doubtful: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
@@ -74,7 +74,7 @@ class FollowCorridor(LooksAhead):
         else openings in the side walls before the end."""
         here = state.p_w[:2]
         self._trail = self._trail or Trail.beginning(state)
-        self._trail.fly(here)
+        self._trail.fly(state)
         self._note_width(layer, state)
         axis = self._trail.direction(layer, here)
         self.wall = is_walled(layer, here, axis)
@@ -93,19 +93,6 @@ class FollowCorridor(LooksAhead):
         self.room = state.stamp_s - self._wide_s > _ROOM_S
         return self.room or self._has_ended(state) or state.stamp_s >= self.until_s
 
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction."""
-        self._looks.carry(update)
-        self._losses.carry(update)
-        if self._trail is not None:
-            self._trail.carry(update)
-        self._doors = [(update.points(middle[None])[0], normal) for middle, normal in self._doors]
-        self._doubtful = [(update.points(middle[None])[0], normal) for middle, normal in self._doubtful]
-        if self._end is not None:
-            self._end.carry(update)
-        if self._target_w is not None:
-            self._target_w = update.points(self._target_w[None])[0]
-
     def _has_ended(self, state: DroneState) -> bool:
         if not self._ending or self._end is None:
             return self._looks.over(state.stamp_s)
@@ -121,9 +108,9 @@ class FollowCorridor(LooksAhead):
         if len(ahead := cells[is_ahead(places, here, axis) & trail.leads_on(places)]):
             self._ending = False
             return far_middle(layer, ahead, axis)
-        trail.end(here)
+        trail.end(state)
         if len(off := cells[trail.turns_off(places, here)]):
-            return self._nearest(layer, off, here, axis)
+            return self._nearest(layer, off, state, axis)
         narrow = straight(layer, here, axis, self._to_door(here, axis))
         if self._ending:  # space between here and the wall leads nowhere
             narrow = narrow[trail.leads_on(layer.centres(narrow))]
@@ -132,32 +119,33 @@ class FollowCorridor(LooksAhead):
         if not self.wall and not self._ending:
             return layer.cells(here + _BLIND_M * axis)[None]
         if self._end is None or not (self._ending or self._end.is_near(here)):
-            self._end, self._losses = DeadEndScan(here.copy(), axis), Losses(math.inf)
+            self._end, self._losses = DeadEndScan(Places(state.views, here), axis), Losses(math.inf)
         self._ending = True
-        return cells[:0] if self._end.given_up else self._beside(layer, self._end, here, trail)
+        return cells[:0] if self._end.given_up else self._beside(layer, self._end, state, trail)
 
-    def _beside(self, layer: Layer, end: DeadEndScan, here: FloatArray, trail: Trail) -> np.ndarray:
+    def _beside(self, layer: Layer, end: DeadEndScan, state: DroneState, trail: Trail) -> np.ndarray:
         """Before a wall: corridors that turn off through a narrow mouth, else openings in the side walls."""
+        here = state.p_w[:2]
         cells = self._left(layer, wide(layer, here, SMEARED_BERTH_M))
         places = layer.centres(cells)
         if len(off := cells[trail.turns_off(places, here) & self._is_this_side(places, here)]):
-            return self._nearest(layer, off, here, end.axis)
+            return self._nearest(layer, off, state, end.axis)
         return self._left(layer, mouths(layer, end.end_w, end.axis, trail.places_w))
 
     def _left(self, layer: Layer, cells: np.ndarray) -> np.ndarray:
         """Cells ``(N, 2)`` that were not inspected without success."""
         return cells[self._looks.left(layer.centres(cells))]
 
-    def _nearest(self, layer: Layer, cells: np.ndarray, here: FloatArray, axis: FloatArray) -> np.ndarray:
+    def _nearest(self, layer: Layer, cells: np.ndarray, state: DroneState, axis: FloatArray) -> np.ndarray:
         """Nearest cell ``(1, 2)`` of corridors that turn off, with hysteresis."""
         places = layer.centres(cells)
-        step = places - here
+        step = places - state.p_w[:2]
         far = np.linalg.norm(step, axis=1)
         cost = far + _TURN_COST_M * (1.0 - (step @ axis) / np.maximum(far, 1e-6))
-        if self._target_w is not None:
-            cost -= 0.5 * (np.linalg.norm(places - self._target_w, axis=1) < 0.7)
+        if len(self._target):
+            cost -= 0.5 * (np.linalg.norm(places - self._target.last_w, axis=1) < 0.7)
         best = int(np.argmin(cost))
-        self._target_w = places[best]
+        self._target = Places(state.views, places[best])
         return cells[[best]]
 
     def _is_this_side(self, p_w: FloatArray, here: FloatArray) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
 from edgeslam_torch.navigation.openings.wall_frame import Walls, wall_directions
 from edgeslam_torch.types import FloatArray
@@ -27,31 +27,37 @@ _SAME_M = 0.3
 class Trail:
     """Path flown along a corridor."""
 
-    places_w: FloatArray
-    """``(N, 2)`` positions, a metre apart."""
+    _places: Places
+    """Positions, a metre apart."""
     began_w: FloatArray
     """``(2,)`` unit vector of the heading at the first position."""
     heading_w: FloatArray
     """``(2,)`` unit vector of the last new metre of flight; initially of the heading."""
-    _dead_ends_w: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    """``(D, 2)`` positions with no continuation ahead."""
+    _dead_ends: Places = field(default_factory=Places)
+    """Positions with no continuation ahead."""
 
     @staticmethod
     def beginning(state: DroneState) -> "Trail":
         """A trail that starts at the drone along its heading."""
         nose = np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad)])
-        return Trail(state.p_w[None, :2].copy(), nose, nose)
+        return Trail(Places(state.views, state.p_w[:2]), nose, nose)
 
-    def fly(self, here_w: FloatArray) -> None:
-        """Add a position ``(2,)`` that is a metre from all others; backing up adds none."""
-        steps = here_w - self.places_w
+    @property
+    def places_w(self) -> FloatArray:
+        """``(N, 2)`` path flown, a metre apart."""
+        return self._places.p_w
+
+    def fly(self, state: DroneState) -> None:
+        """Add the position if it is a metre from all others; backing up adds none."""
+        places_w = self.places_w
+        steps = state.p_w[:2] - places_w
         away = np.linalg.norm(steps, axis=1)
         last = int(np.argmin(away))
         if away[last] < _HEADING_M:
             return
         shares = np.linspace(0.0, 1.0, int(away[last] / _HEADING_M) + 1)[1:]
         self.heading_w = steps[last] / away[last]
-        self.places_w = np.concatenate([self.places_w, self.places_w[last] + shares[:, None] * steps[last]])
+        self._places.add(state.views, places_w[last] + shares[:, None] * steps[last])
 
     def direction(self, layer: Layer, here_w: FloatArray) -> FloatArray:
         """Unit vector ``(2,)`` of the corridor: of its walls if close to the direction of flight, else the latter."""
@@ -63,25 +69,21 @@ class Trail:
             return self.heading_w
         return np.asarray(along[best] * np.sign(cosines[best]))
 
-    def end(self, here_w: FloatArray) -> None:
-        """Mark a position ``(2,)`` as a dead end."""
-        if _apart(here_w[None], self._dead_ends_w, _SAME_M)[0]:
-            self._dead_ends_w = np.concatenate([self._dead_ends_w, here_w[None]])
+    def end(self, state: DroneState) -> None:
+        """Mark the position as a dead end."""
+        if not self._dead_ends.is_near(state.p_w[:2], _SAME_M):
+            self._dead_ends.add(state.views, state.p_w[:2])
 
     def leads_on(self, p_w: FloatArray) -> np.ndarray:
         """Which of the points ``(N, 2)`` are in no dead end."""
-        return _apart(p_w, self._dead_ends_w, _DEAD_END_M)
+        return _apart(p_w, self._dead_ends.p_w, _DEAD_END_M)
 
     def turns_off(self, p_w: FloatArray, here_w: FloatArray) -> np.ndarray:
         """Which of the points ``(N, 2)`` lie neither in the corridor flown up to here nor behind its start."""
-        step = p_w - self.places_w[0]
+        places_w = self.places_w
+        step = p_w - places_w[0]
         behind = (step @ self.began_w < 0.0) & (np.abs(aside(step, self.began_w)) < PASSED_M)
-        return _apart(p_w, np.concatenate([self.places_w, here_w[None]]), PASSED_M) & ~behind
-
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction to the positions; its effect on directions is negligible."""
-        self.places_w = update.points(self.places_w)
-        self._dead_ends_w = update.points(self._dead_ends_w)
+        return _apart(p_w, np.concatenate([places_w, here_w[None]]), PASSED_M) & ~behind
 
 
 def aside(step: FloatArray, axis: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
 """Selection of viewpoints and headings during exploration: borders that the camera has not covered."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.coverage import Borders, Coverage, borders
 from edgeslam_torch.navigation.exploring.frontiers import reachable
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.exit_tracker import FIELD_RAD
 from edgeslam_torch.types import FloatArray
 
@@ -46,8 +46,8 @@ class LooksAround:
     """Borders not covered at the last call."""
     _spots_w: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     """``(G, 2)`` viewpoints of these."""
-    _places_w: list[FloatArray] = field(default_factory=list)
-    """``(2,)`` positions of earlier looks."""
+    _places: Places = field(default_factory=Places)
+    """Positions of earlier looks."""
     _headings: list[float] = field(default_factory=list)
     """Remaining headings, last first."""
     _since_s: float = math.nan
@@ -77,7 +77,7 @@ class LooksAround:
         self._coverage.note(state)
         here = state.p_w[:2]
         if not self._headings and self._is_new(here):
-            self._places_w.append(here.copy())
+            self._places.add(state.views, here)
             self._headings = [state.yaw_rad + turn for turn in reversed(_in_turn(self._sides(here, state.yaw_rad)))]
             self._since_s = state.stamp_s
         if not state.tracked or state.stamp_s - self._since_s > _GIVEN_UP_S:
@@ -86,17 +86,9 @@ class LooksAround:
             self._headings.pop()
         return self._headings[-1] if self._headings else None
 
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction to the positions; its effect on directions is negligible."""
-        self._coverage.carry(update)
-        self._places_w = list(update.points(np.array(self._places_w).reshape(-1, 2)))
-        self._spots_w = update.points(self._spots_w)
-        self._left = replace(self._left, p_w=update.points(self._left.p_w))
-
     def _away_m(self, p_w: FloatArray) -> FloatArray:
         """Distance [m] of points ``(P, 2)`` from the nearest earlier look; infinite without one."""
-        places = np.array(self._places_w).reshape(-1, 2)
-        return np.asarray(np.linalg.norm(p_w[:, None] - places, axis=-1).min(axis=1, initial=math.inf))
+        return np.asarray(np.linalg.norm(p_w[:, None] - self._places.p_w, axis=-1).min(axis=1, initial=math.inf))
 
     def _is_new(self, here_w: FloatArray) -> bool:
         """Whether to look from here: far enough from earlier looks with enough to see, or at a viewpoint."""

@@ -9,7 +9,7 @@ from scipy import ndimage
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.exit_tracker import FARTHEST_M, FIELD_RAD
 from edgeslam_torch.types import FloatArray
 
@@ -71,28 +71,26 @@ def borders(layer: Layer, here_w: FloatArray) -> Borders:
 class Coverage:
     """Record of camera positions and headings."""
 
-    _views: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    """``(V, 3)`` position [m] and heading [rad]."""
+    _places: Places = field(default_factory=Places)
+    _headings: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """``(V,)`` [rad]; the effect of map corrections on them is negligible."""
 
     def note(self, state: DroneState) -> None:
         """Add the current view; dead-reckoned poses are left out."""
         if not state.tracked:
             return
-        new = np.array([*state.p_w[:2], state.yaw_rad])
-        near = np.linalg.norm(self._views[:, :2] - new[:2], axis=1) < _APART_M
-        similar = np.abs(wrapped(self._views[:, 2] - new[2])) < _APART_RAD
+        near = np.linalg.norm(self._places.p_w - state.p_w[:2], axis=1) < _APART_M
+        similar = np.abs(wrapped(self._headings - state.yaw_rad)) < _APART_RAD
         if not (near & similar).any():
-            self._views = np.concatenate([self._views, new[None]])
+            self._places.add(state.views, state.p_w[:2])
+            self._headings = np.append(self._headings, state.yaw_rad)
 
     def unlooked(self, all_: Borders) -> Borders:
         """Borders that no view has covered."""
-        if not len(self._views) or not len(all_.p_w):
+        if not len(self._places) or not len(all_.p_w):
             return all_
-        step = all_.p_w - self._views[:, None, :2]
-        bearing = np.arctan2(step[..., 1], step[..., 0]) - self._views[:, None, 2]
-        shown = all_.before(self._views[:, :2]) & (np.abs(wrapped(bearing)) < FIELD_RAD)
+        places_w = self._places.p_w
+        step = all_.p_w - places_w[:, None]
+        bearing = np.arctan2(step[..., 1], step[..., 0]) - self._headings[:, None]
+        shown = all_.before(places_w) & (np.abs(wrapped(bearing)) < FIELD_RAD)
         return all_[np.flatnonzero(~shown.any(axis=0))]
-
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction to the positions; its effect on directions is negligible."""
-        self._views[:, :2] = update.points(self._views[:, :2])

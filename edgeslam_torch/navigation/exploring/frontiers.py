@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.types import FloatArray
 
 _PASSED_M = 0.25
@@ -52,8 +52,10 @@ def reachable(cells: np.ndarray, layer: Layer, here_w: FloatArray) -> np.ndarray
 class Looks:
     """Record of frontiers inspected without success, and since when none is left."""
 
-    _near: list[tuple[FloatArray, float]] = field(default_factory=list)
-    """Frontiers ``(2,)`` with the time spent near them [s]."""
+    _near: Places = field(default_factory=Places)
+    """Frontiers that the drone was near to."""
+    _spent_s: list[float] = field(default_factory=list)
+    """Time spent near each [s]."""
     _asked_s: float = math.nan
     _nothing_s: float = math.nan
 
@@ -63,7 +65,7 @@ class Looks:
         self._asked_s = state.stamp_s
         places = layer.centres(cells).reshape(-1, 2)
         for place in places[np.linalg.norm(places - state.p_w[:2], axis=1) < _NEAR_M]:
-            self._spend(place, passed)
+            self._spend(place, passed, state)
         kept = cells[self.left(places)]
         if len(kept):
             self._nothing_s = math.nan
@@ -73,7 +75,7 @@ class Looks:
 
     def left(self, p_w: FloatArray) -> np.ndarray:
         """Which of the points ``(N, 2)`` were not inspected without success."""
-        vain = np.array([place for place, spent_s in self._near if spent_s > _LOOKED_S]).reshape(-1, 2)
+        vain = self._near.p_w[np.array(self._spent_s) > _LOOKED_S]
         return np.asarray((np.linalg.norm(p_w[:, None] - vain, axis=2) > _SAME_M).all(axis=1))
 
     def go_on(self) -> None:
@@ -84,14 +86,10 @@ class Looks:
         """Whether no frontier was left for `_ROUND_S`."""
         return now_s - self._nothing_s > _ROUND_S  # false while it is NaN
 
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction."""
-        places = update.points(np.array([place for place, _ in self._near]).reshape(-1, 2))
-        self._near = [(place, spent_s) for place, (_, spent_s) in zip(places, self._near, strict=True)]
-
-    def _spend(self, place_w: FloatArray, passed_s: float) -> None:
-        for k, (other, spent_s) in enumerate(self._near):
-            if np.linalg.norm(place_w - other) <= _SAME_M:
-                self._near[k] = other, spent_s + passed_s
-                return
-        self._near.append((place_w, passed_s))
+    def _spend(self, place_w: FloatArray, passed_s: float, state: DroneState) -> None:
+        same = np.flatnonzero(np.linalg.norm(self._near.p_w - place_w, axis=1) <= _SAME_M)
+        if len(same):
+            self._spent_s[same[0]] += passed_s
+        else:
+            self._near.add(state.views, place_w)
+            self._spent_s.append(passed_s)

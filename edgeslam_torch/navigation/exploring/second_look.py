@@ -11,7 +11,7 @@ import numpy as np
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.frontiers import reachable
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.exit_tracker import PLACES_M, Candidate
 from edgeslam_torch.types import FloatArray
 
@@ -44,21 +44,21 @@ _APART_M = 0.3
 class _Tried:
     """Looks at a candidate."""
 
-    centre_w: FloatArray
+    centre: Places
     until_s: float = np.inf
     """Time at which it is given up."""
-    stood_w: list[FloatArray] = field(default_factory=list)
-    """``(2,)`` viewpoint of each look."""
+    stood: Places = field(default_factory=Places)
+    """Viewpoint of each look."""
     times: int = 1
 
     @property
     def stands(self) -> bool:
         """Whether the drone has reached the current viewpoint."""
-        return len(self.stood_w) == self.times
+        return len(self.stood) == self.times
 
     def is_new(self, p_w: np.ndarray) -> np.ndarray:
         """``(P,)`` whether points ``(P, 2)`` differ from the viewpoints of earlier looks."""
-        before = np.array(self.stood_w[: self.times - 1]).reshape(-1, 2)
+        before = self.stood.p_w[: self.times - 1]
         return np.asarray((np.linalg.norm(p_w[:, None] - before, axis=-1) > _APART_M).all(axis=1))
 
 
@@ -89,7 +89,7 @@ class SecondLook:
 
     def _from(self, cells: np.ndarray, layer: Layer, state: DroneState) -> np.ndarray:
         found = [np.zeros((0, 2), int)]
-        for candidate, tried in self._worth(state.stamp_s):
+        for candidate, tried in self._worth(state):
             p_w = layer.centres(cells).reshape(-1, 2)
             there = cells[_shows(candidate, p_w, _INSIDE_M) & tried.is_new(p_w)]
             if len(there):
@@ -99,38 +99,31 @@ class SecondLook:
 
     def heading_rad(self, state: DroneState) -> float | None:
         """Heading to a candidate visible from here; None otherwise."""
-        for candidate, tried in self._worth(state.stamp_s):
+        for candidate, tried in self._worth(state):
             if _shows(candidate, state.p_w[None, :2])[0] and tried.is_new(state.p_w[None, :2])[0]:
                 if not tried.stands:
-                    tried.stood_w.append(state.p_w[:2].copy())
+                    tried.stood.add(state.views, state.p_w[:2])
                     tried.until_s = state.stamp_s + _STANDS_S
                 step = candidate.centre_w - state.p_w[:2]
                 return float(np.arctan2(step[1], step[0]))
         return None
 
-    def once_more(self, now_s: float) -> None:
+    def once_more(self, state: DroneState) -> None:
         """Allow another look at candidates that were given up."""
-        for tried in (self._of(candidate) for candidate in self._candidates):
-            if now_s >= tried.until_s and tried.stands and tried.times < _TIMES:
+        for tried in (self._of(candidate, state) for candidate in self._candidates):
+            if state.stamp_s >= tried.until_s and tried.stands and tried.times < _TIMES:
                 tried.times, tried.until_s = tried.times + 1, np.inf
 
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction; candidates are set anew."""
-        for tried in self._tried:
-            places = update.points(np.array([tried.centre_w, *tried.stood_w]))
-            tried.centre_w, tried.stood_w = places[0], list(places[1:])
-        self._candidates = ()
-
-    def _worth(self, now_s: float) -> list[tuple[Candidate, _Tried]]:
+    def _worth(self, state: DroneState) -> list[tuple[Candidate, _Tried]]:
         """Candidates that were not given up."""
-        both = [(candidate, self._of(candidate)) for candidate in self._candidates]
-        return [(candidate, tried) for candidate, tried in both if now_s < tried.until_s]
+        both = [(candidate, self._of(candidate, state)) for candidate in self._candidates]
+        return [(candidate, tried) for candidate, tried in both if state.stamp_s < tried.until_s]
 
-    def _of(self, candidate: Candidate) -> _Tried:
+    def _of(self, candidate: Candidate, state: DroneState) -> _Tried:
         for tried in self._tried:
-            if np.linalg.norm(tried.centre_w - candidate.centre_w) < _SAME_M:
+            if tried.centre.is_near(candidate.centre_w, _SAME_M):
                 return tried
-        self._tried.append(_Tried(candidate.centre_w.copy()))
+        self._tried.append(_Tried(Places(state.views, candidate.centre_w)))
         return self._tried[-1]
 
 

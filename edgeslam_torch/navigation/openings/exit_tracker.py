@@ -1,14 +1,14 @@
 """Tracking of exits over a flight: a detection is confirmed by detections from other viewpoints."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.map_views import MapViews, Places
 from edgeslam_torch.navigation.openings.aperture_hypotheses import NEAR_M, aperture_hypotheses
 from edgeslam_torch.navigation.openings.detour import has_detour
 from edgeslam_torch.navigation.openings.exits import WIDEST_M, Gap, distinct, openings
@@ -84,10 +84,12 @@ class Candidate:
 class _Seen:
     """Detections of one opening."""
 
-    gaps: list[Gap]
-    pictures: list[int]
-    """Frame number of each detection."""
-    places_w: list[FloatArray]
+    centres: Places = field(default_factory=Places)
+    """Of each detection, tied to the view that it was detected in: a misplaced submap may overlap it in space."""
+    tips: Places = field(default_factory=Places)
+    """A width behind each centre: with it, width and normal follow the map, too."""
+    places: Places = field(default_factory=Places)
+    """Viewpoints."""
     near: int = 0
     shown: int = 0
     """Valid views (`_is_looked_at`) with a detection ..."""
@@ -102,9 +104,29 @@ class _Seen:
     flown: bool = False
     """Whether the drone has flown through it, which proves that it is open."""
 
+    def add(self, views: MapViews, gap: Gap) -> None:
+        """Add a detection in the newest view."""
+        self.centres.add(views, gap.centre_w)
+        self.tips.add(views, gap.centre_w + gap.width_m * gap.normal_w)
+
     @property
     def centre_w(self) -> FloatArray:
-        return np.asarray(np.median([g.centre_w for g in self.gaps], axis=0))
+        return np.asarray(np.median(self.centres.p_w, axis=0))
+
+    @property
+    def widths_m(self) -> FloatArray:
+        """``(N,)`` of each detection."""
+        return np.asarray(np.linalg.norm(self.tips.p_w - self.centres.p_w, axis=1))
+
+    @property
+    def normals_w(self) -> FloatArray:
+        """``(N, 2)`` of each detection; the sign depends on the side of the drone."""
+        return (self.tips.p_w - self.centres.p_w) / self.widths_m[:, None]
+
+    @property
+    def normal_w(self) -> FloatArray:
+        """``(2,)`` away from the first viewpoint."""
+        return np.asarray(self.normals_w[0])
 
     @property
     def is_shown(self) -> bool:
@@ -154,12 +176,12 @@ class ExitTracker:
             _note(self._hypotheses, gap, state)
         often = [s for s in self._seen if s.near >= _LOOKS]
         open_ = [s for s in often if s.flown or s.gone <= _GONE]
-        twice = [s for s in open_ if _places(s.places_w) >= 2]
+        twice = [s for s in open_ if _places(s.places.p_w) >= 2]
         self.exits = self._exits([s for s in twice if s.flown or s.is_shown], walls.layer, state)
-        unsure = [s for s in open_ if not s.flown and (s.shown <= max(s.missed, 1) or _places(s.places_w) < 2)]
-        doubted = [(s, _places(s.places_w) < 2) for s in unsure]
+        unsure = [s for s in open_ if not s.flown and (s.shown <= max(s.missed, 1) or _places(s.places.p_w) < 2)]
+        doubted = [(s, _places(s.places.p_w) < 2) for s in unsure]
         repeated = [s for s in self._hypotheses if s.near >= _HYPOTHESIS_LOOKS]
-        doubted += [(s, False) for s in repeated if not any(_same(s.gaps[0], other) for other in often)]
+        doubted += [(s, False) for s in repeated if not any(_are_same(s, other) for other in often)]
         self.candidates = tuple(_candidate(*doubt) for doubt in doubted if not _parts_nothing(doubt[0], walls.layer))
 
     def _count(self, free: list[Gap], partly: list[Gap], state: DroneState) -> None:
@@ -173,7 +195,7 @@ class ExitTracker:
                 seen.missed, seen.gone = seen.missed + 1, seen.gone + 1
         for gap in free:
             _note(self._seen, gap, state)
-        self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
+        self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.centres), _LOOKS)]
 
     def _exits(self, good: list[_Seen], layer: Layer, state: DroneState) -> tuple[Exit, ...]:
         """Openings that separate two rooms, one per passage."""
@@ -186,45 +208,38 @@ class ExitTracker:
         single = [e for k, e in enumerate(exits) if not any(_one_passage(e, other) for other in exits[:k])]
         return tuple(sorted(single, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - state.p_w[:2]))))
 
-    def carry(self, update: MapUpdate) -> None:
-        """Apply a map correction; `exits` follow at the next update."""
-        for seen in [*self._seen, *self._hypotheses]:
-            centres = update.points(np.array([gap.centre_w for gap in seen.gaps]), seen.pictures)
-            beyond = update.points(np.array([gap.centre_w + 0.1 * gap.normal_w for gap in seen.gaps]), seen.pictures)
-            seen.gaps = [_corrected(*gap, update.ratio) for gap in zip(seen.gaps, centres, beyond, strict=True)]
-            seen.places_w = list(update.points(np.array(seen.places_w).reshape(-1, 2)))
-        self._looked_w = None
+    def expire(self) -> None:
+        """Make an update due, since the map was corrected; the way from the last one is no way that was flown."""
+        self._looked_s, self._looked_w = -math.inf, None
 
 
 def _note(among: list[_Seen], gap: Gap, state: DroneState) -> None:
     here_w = state.p_w[:2]
     seen = next((s for s in among if _same(gap, s)), None)
     if seen is None:
-        seen = _Seen([], [], [])
+        seen = _Seen()
         among.append(seen)
-    seen.gaps.append(gap)
-    seen.pictures.append(-1 if state.view is None else state.view.picture)
+    seen.add(state.views, gap)
     seen.gone = 0
     if np.linalg.norm(gap.centre_w - here_w) < NEAR_M:
         seen.near += 1
-        seen.places_w.append(here_w.copy())
+        seen.places.add(state.views, here_w)
 
 
 def _candidate(seen: _Seen, elsewhere: bool) -> Candidate:
-    return Candidate(seen.centre_w, seen.gaps[0].normal_w, seen.places_w[0], elsewhere)
+    return Candidate(seen.centre_w, seen.normal_w, seen.places.p_w[0], elsewhere)
 
 
 def _parts_nothing(seen: _Seen, layer: Layer) -> bool:
     """Whether it is too wide or a gap within one room."""
-    width_m = float(np.median([gap.width_m for gap in seen.gaps]))
-    return width_m > WIDEST_M or has_detour(layer, seen.centre_w, seen.gaps[0].normal_w, width_m)
+    width_m = float(np.median(seen.widths_m))
+    return width_m > WIDEST_M or has_detour(layer, seen.centre_w, seen.normal_w, width_m)
 
 
 def _exit(seen: _Seen, state: DroneState) -> Exit:
     """Robust estimate of an opening from its detections."""
-    centres, widths = np.array([g.centre_w for g in seen.gaps]), np.array([g.width_m for g in seen.gaps])
-    first = seen.gaps[0].normal_w
-    turned = [g.normal_w * np.sign(g.normal_w @ first) for g in seen.gaps]
+    centres, widths, normals = seen.centres.p_w, seen.widths_m, seen.normals_w
+    turned = normals * np.sign(normals @ normals[0])[:, None]
     normal = np.sum(turned, axis=0) / np.linalg.norm(np.sum(turned, axis=0))
     cell = 0.1 * _CELL_SIGMAS
     centre, width = np.median(centres, axis=0), float(np.median(widths))
@@ -233,7 +248,7 @@ def _exit(seen: _Seen, state: DroneState) -> Exit:
     position = math.hypot(cell, spread, state.position_sigma_m, state.scale_sigma * away)
     width_sigma = math.hypot(cell, float(np.std(widths)), state.scale_sigma * width)
     return Exit(np.array([*centre, state.p_w[2]]), np.array([*normal, 0.0]), width, width_sigma, position,
-                _places(seen.places_w))  # fmt: skip
+                _places(seen.places.p_w))  # fmt: skip
 
 
 def _passed_by(exit_: Exit, layer: Layer) -> bool:
@@ -252,16 +267,19 @@ def _one_passage(exit_: Exit, other: Exit) -> bool:
     return behind or float(np.linalg.norm(offset)) < _SAME_M
 
 
-def _corrected(gap: Gap, centre_w: FloatArray, beyond_w: FloatArray, ratio: float) -> Gap:
-    """The opening after a map correction of its centre and a point behind it."""
-    normal = (beyond_w - centre_w) / np.linalg.norm(beyond_w - centre_w)
-    return replace(gap, centre_w=centre_w, normal_w=normal, width_m=ratio * gap.width_m)
-
-
 def _same(gap: Gap, seen: _Seen) -> bool:
     """Whether a detection belongs to an opening; the sign of the normal depends on the side of the drone."""
-    turned = math.acos(min(1.0, abs(float(gap.normal_w @ seen.gaps[0].normal_w)))) if seen.gaps else 0.0
-    return turned < _SAME_RAD and float(np.linalg.norm(gap.centre_w - seen.centre_w)) < _SAME_M
+    return _is_one(gap.centre_w, gap.normal_w, seen)
+
+
+def _are_same(one: _Seen, other: _Seen) -> bool:
+    """Whether the first detection of an opening belongs to another one."""
+    return _is_one(one.centres.p_w[0], one.normal_w, other)
+
+
+def _is_one(centre_w: FloatArray, normal_w: FloatArray, seen: _Seen) -> bool:
+    turned = math.acos(min(1.0, abs(float(normal_w @ seen.normal_w))))
+    return turned < _SAME_RAD and float(np.linalg.norm(centre_w - seen.centre_w)) < _SAME_M
 
 
 def _is_looked_at(seen: _Seen, state: DroneState) -> bool:
@@ -269,22 +287,22 @@ def _is_looked_at(seen: _Seen, state: DroneState) -> bool:
     offset = seen.centre_w - state.p_w[:2]
     away = float(np.linalg.norm(offset))
     bearing = float(wrapped(np.array(math.atan2(offset[1], offset[0]) - state.yaw_rad)))
-    squarely = abs(float(offset @ seen.gaps[0].normal_w)) > _SQUARELY_COS * away
+    squarely = abs(float(offset @ seen.normal_w)) > _SQUARELY_COS * away
     return _NEAREST_M < away < FARTHEST_M and abs(bearing) < FIELD_RAD and squarely
 
 
 def _leads_through(seen: _Seen, from_w: FloatArray, to_w: FloatArray) -> bool:
     """Whether the segment from ``(2,)`` to ``(2,)`` crosses an opening."""
-    normal, centre = seen.gaps[0].normal_w, seen.centre_w
+    normal, centre = seen.normal_w, seen.centre_w
     before, behind = float((from_w - centre) @ normal), float((to_w - centre) @ normal)
     if before * behind >= 0.0 or np.linalg.norm(to_w - from_w) > _STEP_M:
         return False
     crossing = from_w + before / (before - behind) * (to_w - from_w) - centre
-    width_m = float(np.median([gap.width_m for gap in seen.gaps]))
+    width_m = float(np.median(seen.widths_m))
     return abs(float(crossing @ np.array([-normal[1], normal[0]]))) < 0.5 * width_m
 
 
-def _places(places_w: list[FloatArray]) -> int:
+def _places(places_w: FloatArray) -> int:
     """Number of distinct viewpoints."""
     kept: list[FloatArray] = []
     for place in places_w:
