@@ -23,7 +23,7 @@ from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.tasks import Task
 
 PLAN = "plan.jsonl"
-_HEAD = {"format": "edgeslam planner", "version": 1}
+_HEAD = {"format": "edgeslam planner", "version": 2}
 _MAX_BYTES = 1 << 26
 """Maximum size of a line and of an array in it; the largest view has 2 MB."""
 _OURS = ("edgeslam_torch.navigation.", "edgeslam_torch.flying.")
