@@ -154,7 +154,7 @@ def _array(shape) -> bytes:
     [
         (lambda lines: [lines[0], lines[1], b"{half a line\n", *lines[2:]], "line 3 is damaged"),
         (lambda lines: [b'{"format": "soup"}\n', *lines[1:]], "not a planner's record"),
-        (lambda lines: [lines[0].replace(b"1", b"9"), *lines[1:]], "version 9 is not supported"),
+        (lambda lines: [lines[0].replace(b"2", b"9"), *lines[1:]], "version 9 is not supported"),
         (lambda lines: [lines[0], b'{"kind": "os:system"}\n'], "os:system is unknown"),
         (lambda lines: [lines[0], b'{"kind": "edgeslam_torch.config:SlamConfig"}\n'], "SlamConfig is unknown"),
         (lambda lines: [lines[0], lines[1], lines[2].replace(b"GoTo", b"GoBy"), *lines[3:]], "GoBy is unknown"),
