@@ -293,8 +293,8 @@ def aged_since(stamps_s: FloatArray, began_s: float, now_s: float) -> FloatArray
 
 
 def turned_since(T: FloatArray) -> FloatArray:
-    """Maximum rotation since each pose ``T`` ``(N, 4, 4)`` relative to the last one, in fields of view beyond the first,
-    within which views overlap, ``(N,)``."""
+    """Maximum rotation ``(N,)`` since each pose ``T`` ``(N, 4, 4)`` relative to the last one, in fields of view beyond
+    the first, within which views overlap."""
     cosine = 0.5 * (np.einsum("nij,ij->n", T[:, :3, :3], T[-1, :3, :3]) - 1.0)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     return np.maximum(np.maximum.accumulate(angle[::-1])[::-1] / _VIEW_RAD - 1.0, 0.0)
