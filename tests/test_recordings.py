@@ -1,5 +1,8 @@
 """Real recordings through the whole system, default settings: the bars of a release."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from edgeslam_torch.config import SlamConfig
@@ -22,19 +25,25 @@ BARS = {
     "tartan_hospital": (0.2900, 0.2900, 0.98, 76_000),
 }
 
+STARTS = {"tum_fr1_rpy_depth": (0, 3, 5)}
+"""First frames of runs of which the median counts, where the start moves the error by a quarter."""
+
 
 @pytest.mark.parametrize("name", BARS)
 def test_sequence_is_within_its_bar(data_dir, tmp_path, name):
-    """Figures of today with a margin; those that a user's flight is like beside those that were tuned on."""
+    """Figures of images alone with a margin; those that a user's flight is like beside those that were tuned on."""
     ate_m, live_m, share, points = BARS[name]
-    result = run(open_source(data_dir / name), tmp_path / "out", SlamConfig())
-    score = evaluate_run(result.folder, data_dir / name, judge_map=False)
-    assert score.ate_sim3_m <= ate_m
-    assert score.ate_online_sim3_m <= live_m
-    assert score.coverage >= share
-    assert result.summary["map"]["edge_points"] >= points
-    assert [p for p in result.summary["pieces"] if p["supported"]] == result.summary["pieces"]
-    assert len(result.summary["pieces"]) == 1
+    images = replace(open_source(data_dir / name), imu=None, imu_readings=None)
+    errors = []
+    for start in STARTS.get(name, (0,)):
+        result = run(images.part(start, 1) if start else images, tmp_path / f"out{start}", SlamConfig())
+        score = evaluate_run(result.folder, data_dir / name, judge_map=False)
+        errors.append((score.ate_sim3_m, score.ate_online_sim3_m))
+        assert score.coverage >= share
+        assert result.summary["map"]["edge_points"] >= points
+        assert [p for p in result.summary["pieces"] if p["supported"]] == result.summary["pieces"]
+        assert len(result.summary["pieces"]) == 1
+    assert (np.median(errors, axis=0) <= [ate_m, live_m]).all()
 
 
 def test_two_runs_of_a_recording_give_the_same_bytes(data_dir, tmp_path):
