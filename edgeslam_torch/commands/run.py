@@ -350,7 +350,7 @@ def _report(result: "RunResult", source: "Source") -> None:
     elif summary["map"]["anchors"] == 0:
         print("units are arbitrary: no point was triangulated, so the scale is unknown; did the camera move?")
     else:
-        print("units are arbitrary: neither telemetry nor a depth network provided the scale")
+        print("units are arbitrary: neither telemetry, an IMU nor a depth network provided the scale")
     counts = summary["map"]
     if counts["edge_points"] == 0:
         _say("warning: the edge map is empty")
