@@ -14,6 +14,9 @@ from edgeslam_torch.types import FloatArray, Record, TelemetrySample
 
 _RIGID = 1e-3
 """Tolerance of a rotation matrix in a file of four digits."""
+_CLIPPED, _STEPS = 3, 10.0
+"""Readings in a row at an axis' largest magnitude, more than so many quantisation steps above the least: the end of its
+range. Noise at rest repeats its largest value, too, a few steps above the least."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -52,6 +55,19 @@ class ImuReadings(Record):
     def has_gyroscope(self) -> bool:
         """Whether there are angular rates."""
         return not np.isnan(self.angular_rate_rad_s).all()
+
+    @property
+    def range_ends(self) -> FloatArray:
+        """Largest magnitude ``(6,)`` of angular rates and accelerations at which readings are clipped; infinite where
+        none are."""
+        ends = np.full(6, np.inf)
+        values = np.abs(np.concatenate([self.angular_rate_rad_s, self.acceleration_m_s2], axis=1))
+        for axis in range(0 if self.has_gyroscope else 3, 6) if len(self) >= _CLIPPED else ():
+            column, known = values[:, axis], np.unique(values[:, axis])
+            runs = np.convolve(column == known[-1], np.ones(_CLIPPED), "valid") == _CLIPPED
+            if len(known) > 1 and runs.any() and known[-1] - known[0] > _STEPS * np.diff(known).min():
+                ends[axis] = known[-1]
+        return ends
 
     @property
     def rate_hz(self) -> float:

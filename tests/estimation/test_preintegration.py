@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.inertial.preintegration import Preintegrated, preintegrate
+from edgeslam_torch.imu import ImuModel, ImuReadings
 
 STAMPS_S = np.arange(0.0, 1.2, 0.005)
 RATE = np.stack([np.sin(3.0 * STAMPS_S + k) for k in range(3)], axis=1)
@@ -12,10 +13,11 @@ FORCE = np.stack([2.0 * np.cos(2.0 * STAMPS_S + k) for k in range(3)], axis=1) +
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.1])
 EDGES_S = np.array([0.1, 0.3512, 0.6037, 0.9])
 NOISE = (1.7e-4, 2e-3)
+MODEL = ImuModel(gyroscope_noise_density=NOISE[0], accelerometer_noise_density=NOISE[1])
 
 
 def found(bias: np.ndarray = BIAS, edges_s: np.ndarray = EDGES_S) -> Preintegrated:
-    return preintegrate(STAMPS_S, RATE, FORCE, edges_s, bias, NOISE)
+    return preintegrate(ImuReadings(STAMPS_S, RATE, FORCE), edges_s, bias, MODEL)
 
 
 @pytest.mark.parametrize("k", range(3))
@@ -52,9 +54,8 @@ def test_increments_of_exact_motion() -> None:
     rate, radius, seconds = 1.5, 2.0, 0.8
     force = np.array([-radius * rate**2, 0.0, 0.0])  # towards the centre, in axes that turn along
     ones = np.ones((len(STAMPS_S), 1))
-    ours = preintegrate(
-        STAMPS_S, ones * [0.0, 0.0, rate], ones * force, np.array([0.1, 0.1 + seconds]), np.zeros(6), NOISE
-    )
+    readings = ImuReadings(STAMPS_S, ones * [0.0, 0.0, rate], ones * force)
+    ours = preintegrate(readings, np.array([0.1, 0.1 + seconds]), np.zeros(6), MODEL)
     angle = rate * seconds
     np.testing.assert_allclose(Rotation.from_matrix(ours.R[0]).as_rotvec(), [0.0, 0.0, angle], atol=1e-12)
     speed = radius * rate
@@ -78,5 +79,26 @@ def test_derivatives_by_the_bias(component: int) -> None:
 )
 def test_intervals_without_readings_are_told(edges_s: list[float], complete: bool) -> None:
     there = (STAMPS_S < 0.45) | (STAMPS_S > 0.55)
-    ours = preintegrate(STAMPS_S[there], RATE[there], FORCE[there], np.array(edges_s), BIAS, NOISE)
+    ours = preintegrate(ImuReadings(STAMPS_S[there], RATE[there], FORCE[there]), np.array(edges_s), BIAS, MODEL)
     assert ours.complete.tolist() == [complete]
+
+
+def test_an_interval_with_clipped_readings_is_unknown() -> None:
+    readings = ImuReadings(STAMPS_S, RATE, np.clip(FORCE, -1.9, [1.9, 1.9, 8.5]))
+    ends = readings.range_ends
+    assert np.isfinite(ends[3:]).tolist() == [True, True, True]
+    assert not np.isfinite(ends[:3]).any()
+    edges_s = np.arange(0.052, 1.15, 0.05)
+    clipped = STAMPS_S[(np.abs(FORCE) >= ends[3:]).any(axis=1)]
+    free = [
+        not ((clipped > a - 0.005) & (clipped < b + 0.005)).any()
+        for a, b in zip(edges_s[:-1] - 1e-9, edges_s[1:] + 1e-9, strict=True)
+    ]
+    assert 0 < sum(free) < len(free)
+    assert preintegrate(readings, edges_s, BIAS, MODEL, ends).complete.tolist() == free
+
+
+def test_noise_at_rest_is_not_clipped() -> None:
+    rng = np.random.default_rng(0)
+    still = [0.1 * np.rint(rng.standard_normal((500, 3))), 9.8 + 0.1 * np.rint(rng.standard_normal((500, 3)))]
+    assert not np.isfinite(ImuReadings(0.005 * np.arange(500.0), *still).range_ends).any()

@@ -119,6 +119,7 @@ def align(
     model: ImuModel,
     mount: tuple[FloatArray, float],
     before: Alignment | None = None,
+    range_ends: FloatArray | None = None,
 ) -> Alignment | None:
     """Align visual poses with inertial readings.
 
@@ -129,6 +130,7 @@ def align(
         model: Noise, and what is known of mount and clock.
         mount: Rotation camera to IMU ``(3, 3)`` and time offset [s], as known or by `imu_mount`.
         before: An earlier result in the same map, to start from.
+        range_ends: As for `preintegrate`.
 
     Returns:
         The estimate, whether or not its scale is accurate; None if readings do not cover enough nodes, or the
@@ -139,10 +141,9 @@ def align(
     known = model.T_imu_cam
     lever = np.zeros(3) if known is None else known[:3, 3]
     offset_s = mount[1] if before is None else before.offset_s
-    noise = model.gyroscope_noise_density, model.accelerometer_noise_density
     bias = np.zeros(6) if before is None else before.bias[-1]
     rates, moments = readings.angular_rate_rad_s, stamps_s + offset_s
-    pre = preintegrate(readings.stamps_s, rates, readings.acceleration_m_s2, moments, bias, noise)
+    pre = preintegrate(readings, moments, bias, model, range_ends)
     R_m_c, z = T_m_c[:, :3, :3], T_m_c[:, :3, 3]
     extent = float(np.sqrt(np.mean(np.sum((z - z.mean(axis=0)) ** 2, axis=1))))
     if pre.complete.sum() < LEAST_NODES - 1 or extent <= 0.0:

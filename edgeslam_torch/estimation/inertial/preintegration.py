@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.compiled import compiled
+from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.types import FloatArray
 
 MAX_GAP_S = 0.05
@@ -47,32 +48,32 @@ class Preintegrated:
     bias: FloatArray
     """``(6,)`` biases at which they hold [rad/s, m/s^2]."""
     complete: NDArray[np.bool_]
-    """``(K,)`` whether readings cover the interval."""
+    """``(K,)`` whether readings cover the interval, none of them clipped."""
 
 
 def preintegrate(
-    stamps_s: FloatArray,
-    angular_rate: FloatArray,
-    acceleration: FloatArray,
-    edges_s: FloatArray,
-    bias: FloatArray,
-    noise: tuple[float, float],
+    readings: ImuReadings, edges_s: FloatArray, bias: FloatArray, model: ImuModel, range_ends: FloatArray | None = None
 ) -> Preintegrated:
     """Increments between successive moments.
 
     Args:
-        stamps_s: Increasing stamps of the readings ``(N,)``.
-        angular_rate: ``(N, 3)`` [rad/s].
-        acceleration: Specific force ``(N, 3)`` [m/s^2].
-        edges_s: Increasing moments ``(K + 1,)`` on the same clock.
+        readings: Of gyroscope and accelerometer.
+        edges_s: Increasing moments ``(K + 1,)`` on their clock.
         bias: Of gyroscope and accelerometer ``(6,)``, subtracted.
-        noise: Densities of gyroscope [rad/s/sqrt(Hz)] and accelerometer [m/s^2/sqrt(Hz)].
+        model: Noise densities.
+        range_ends: As `ImuReadings.range_ends`: an interval with a clipped reading is not complete.
     """
-    readings = np.column_stack([angular_rate, acceleration])
-    stamps_s = np.concatenate([stamps_s[:1] - HELD_S, stamps_s, stamps_s[-1:] + HELD_S])
-    readings = np.concatenate([readings[:1], readings, readings[-1:]])
-    found = _preintegrate(stamps_s, readings, edges_s, bias, noise[0] ** 2, noise[1] ** 2, MAX_GAP_S)
-    return Preintegrated(np.diff(edges_s), *found[:-1], bias.copy(), found[-1])
+    stamps_s = readings.stamps_s
+    values = np.column_stack([readings.angular_rate_rad_s, readings.acceleration_m_s2])
+    held_s = np.concatenate([stamps_s[:1] - HELD_S, stamps_s, stamps_s[-1:] + HELD_S])
+    noise = model.gyroscope_noise_density**2, model.accelerometer_noise_density**2
+    found = _preintegrate(held_s, np.concatenate([values[:1], values, values[-1:]]), edges_s, bias, *noise, MAX_GAP_S)
+    complete = found[-1]
+    if range_ends is not None and np.isfinite(range_ends).any():
+        clipped = np.concatenate([[0], np.cumsum((np.abs(values) >= range_ends).any(axis=1))])
+        first, last = np.searchsorted(stamps_s, edges_s[:-1]) - 1, np.searchsorted(stamps_s, edges_s[1:]) + 1
+        complete &= clipped[np.minimum(last, len(values))] == clipped[np.maximum(first, 0)]
+    return Preintegrated(np.diff(edges_s), *found[:-1], bias.copy(), complete)
 
 
 @compiled

@@ -57,7 +57,8 @@ class Imu:
         self._mount: tuple[FloatArray, float] | None = None
         if model.T_imu_cam is not None and model.time_offset_s is not None:
             self._mount = model.T_imu_cam[:3, :3], model.time_offset_s
-        self._since_s = self._fitted_s = self._first_s = -math.inf
+        self._range_ends = np.full(6, np.inf)
+        self._since_s = self._fitted_s = -math.inf
 
     def __len__(self) -> int:
         return sum(map(len, self._parts))
@@ -99,6 +100,7 @@ class Imu:
         if len(stamps_s) < 2:
             return
         readings = self._between(stamps_s[0] - margin_s - 0.1, math.inf)
+        self._range_ends = np.minimum(self._range_ends, readings.range_ends)
         if self._mount is None:
             self._mount = imu_mount(stamps_s, T_m_c[:, :3, :3], readings, self.model)
             if self._mount is None:
@@ -120,7 +122,7 @@ class Imu:
         self, stamps_s: FloatArray, T_m_c: FloatArray, readings: ImuReadings, before: Alignment | None
     ) -> Alignment | None:
         assert self._mount is not None
-        return align(stamps_s, T_m_c, readings, self.model, self._mount, before)
+        return align(stamps_s, T_m_c, readings, self.model, self._mount, before, self._range_ends)
 
     @property
     def scale(self) -> LogScale | None:
@@ -151,14 +153,7 @@ class Imu:
         if len(readings) < 2:
             return None
         moments = np.array([from_s, to_s]) + found.offset_s
-        felt = preintegrate(
-            readings.stamps_s,
-            readings.angular_rate_rad_s,
-            readings.acceleration_m_s2,
-            moments,
-            found.bias[-1],
-            (self.model.gyroscope_noise_density, self.model.accelerometer_noise_density),
-        )
+        felt = preintegrate(readings, moments, found.bias[-1], self.model, self._range_ends)
         return found.R_i_c.T @ felt.R[0].T @ found.R_i_c if felt.complete[0] else None
 
     def _between(self, after_s: float, until_s: float) -> ImuReadings:

@@ -22,9 +22,6 @@ _FASTEST_RAD_S = 70.0
 """4000 deg/s: the largest range of gyroscopes that are sold for drones."""
 _GAP, _GAP_S = 5.0, 0.05
 """Multiple of the usual interval between readings, and time, beyond which there is a gap."""
-_NEAR_END = 0.9
-_CLIPPED = 3
-"""Readings in a row at the largest value, and more of them than just below it: the sensor's range ends there."""
 _EUROC = ((1, 2, 3), (4, 5, 6))
 _GYROSCOPE = re.compile(r"(w|gyr|omega|ang|rot|g(?=[xyz]$)).*[xyz]")
 _ACCELEROMETER = re.compile(r"(a|lin|force|f(?=[xyz]$)).*[xyz]")
@@ -106,7 +103,8 @@ def tidied(
     if has_gyroscope and float(np.abs(rate).max()) > _FASTEST_RAD_S:
         fastest = float(np.abs(rate).max())
         raise SourceError(f"angular rates of up to {fastest:.0f} rad/s: degrees? Then name the columns [deg/s]")
-    return ImuReadings(stamps_s, rate, force), [*remarks, *said, *_gaps(stamps_s), *_clipped(rate, force)]
+    readings = ImuReadings(stamps_s, rate, force)
+    return readings, [*remarks, *said, *_gaps(stamps_s), *_clipped(readings)]
 
 
 def _in_m_s2(force: FloatArray) -> tuple[FloatArray, list[str]]:
@@ -127,14 +125,14 @@ def _gaps(stamps_s: FloatArray) -> list[str]:
     return [f"{len(gaps)} gaps in the readings, up to {gaps.max():.3g} s"] if len(gaps) else []
 
 
-def _clipped(rate: FloatArray, force: FloatArray) -> list[str]:
-    remarks = []
-    for name, values in (("gyroscope", rate), ("accelerometer", force)):
-        for axis, column in zip("xyz", np.abs(values).T, strict=True):
-            at_end = column == column.max()
-            runs = np.convolve(at_end, np.ones(_CLIPPED), "valid") == _CLIPPED
-            near_end = (column > _NEAR_END * column.max()) & ~at_end
-            if runs.any() and at_end.sum() > near_end.sum() and np.ptp(column) > 0:
-                share, end = 100.0 * at_end.mean(), float(column.max())
-                remarks.append(f"the {name}'s {axis} is clipped at {end:.4g} in {share:.2g} % of the readings")
-    return remarks
+def _clipped(readings: ImuReadings) -> list[str]:
+    names = [f"{name}'s {axis}" for name in ("gyroscope", "accelerometer") for axis in "xyz"]
+    values, ends = (
+        np.abs(np.concatenate([readings.angular_rate_rad_s, readings.acceleration_m_s2], axis=1)),
+        readings.range_ends,
+    )
+    return [
+        f"the {name} is clipped at {end:.4g} in {100.0 * np.mean(column == end):.2g} % of the readings"
+        for name, column, end in zip(names, values.T, ends.tolist(), strict=True)
+        if np.isfinite(end)
+    ]
