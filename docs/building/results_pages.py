@@ -52,7 +52,8 @@ def blocks(release: dict[str, Any], peers: Sequence[dict[str, Any]]) -> dict[str
         "summary": _table(("", "ATE [m]", "map [cm]", "CPU [ORB]", "others: ATE [m], frames"), _summary(runs, peers)),
         "accuracy": _table(_RECORDING_HEADER, [_accuracy(runs[name], title) for name, title in RECORDINGS.items()]),
         "map_and_cost": _table(_MAP_HEADER, [_map_and_cost(runs[name], title) for name, title in RECORDINGS.items()]),
-        "telemetry": _table(_TELEMETRY_HEADER, _with_telemetry(runs)),
+        "telemetry": _table(_SENSOR_HEADER, _with_sensor(runs, "telemetry/rounded")),
+        "imu": _table(_SENSOR_HEADER, _with_sensor(runs, "imu/recorded")),
         "flights": _table(_FLIGHT_HEADER, [_flight(runs[name], title) for name, title in FLIGHTS.items()]),
         "peers": _block("\n\n".join(_peers(runs, peers))),
         "block_caption": _block_caption(runs["flight/block"]),
@@ -71,7 +72,7 @@ _MAP_HEADER = [
     "CPU [ORB]",
     "memory [MB]",
 ]
-_TELEMETRY_HEADER = ["recording", "scale error", "stated sigma", "SE(3) [m]", "ATE [m]", "live [m]", "CPU [ORB]"]
+_SENSOR_HEADER = ["recording", "scale error", "stated sigma", "SE(3) [m]", "ATE [m]", "live [m]", "CPU [ORB]"]
 _FLIGHT_HEADER = [
     "flight",
     "frames",
@@ -128,12 +129,12 @@ def _map_and_cost(f: Figures, title: str) -> list[str]:
     ]
 
 
-def _with_telemetry(runs: dict[str, Figures]) -> list[list[str]]:
+def _with_sensor(runs: dict[str, Figures], cells: str) -> list[list[str]]:
     return [
         [title, _off(f, "scale"), _median(f, "scale_sigma", "{:.1f} %", 100.0), _spread(f, "se3_m"),
          _spread(f, "ate_m"), _spread(f, "online_m"), _spread(f, "cpu_orb", "{:.1f}")]
         for name, title in RECORDINGS.items()
-        if (f := runs.get(f"telemetry/rounded/{name.partition('/')[0]}"))
+        if (f := runs.get(f"{cells}/{name.partition('/')[0]}"))
     ]  # fmt: skip
 
 

@@ -11,13 +11,13 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import find_recordings
 from edgeslam_torch.eval.judge import sources
 from edgeslam_torch.eval.judge.flights import NONE
-from edgeslam_torch.eval.judge.simulated_imu import IMU_KINDS
+from edgeslam_torch.eval.judge.simulated_imu import IMU_KINDS, RECORDED
 from edgeslam_torch.eval.judge.simulated_telemetry import KINDS
 from edgeslam_torch.readers.source import Recording
 from edgeslam_torch.synthetic.flights.courses import COURSES
 
 SETS = ("base", "variants", "flights", "telemetry", "imu", "all")
-"""Recordings as they are, their variants, simulated flights, simulated telemetry, a simulated IMU, everything."""
+"""Images of recordings, their variants, simulated flights, simulated telemetry, recorded and simulated IMUs, all."""
 CASES: dict[str, Any] = tomllib.loads(Path(__file__).with_name("cases.toml").read_text(encoding="utf-8"))
 MIN_FRAMES = 30
 """Shorter recordings, and variants that leave fewer, are not judged."""
@@ -88,7 +88,7 @@ class Cell:
     telemetry: str = ""
     """Simulated telemetry: a name in `simulated_telemetry.KINDS`."""
     imu: str = ""
-    """Simulated IMU: a name in `simulated_imu.IMU_KINDS`."""
+    """A name in `simulated_imu.IMU_KINDS`, or `simulated_imu.RECORDED`."""
 
     @property
     def base(self) -> str:
@@ -134,6 +134,8 @@ def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequen
             made += [Cell(f"telemetry/{kind}/{name}", 0, str(folder), telemetry=kind) for kind in KINDS]
         if which in ("imu", "all") and name in CASES["imu"]["recordings"]:
             made += [Cell(f"imu/{kind}/{name}", 0, str(folder), imu=kind) for kind in IMU_KINDS]
+        if which in ("imu", "all") and name in CASES["imu"][RECORDED]:
+            made.append(Cell(f"imu/{RECORDED}/{name}", 0, str(folder), imu=RECORDED))
     if which in ("imu", "all"):
         made += [
             Cell(f"imu/{kind}/{course}", 0, course=course, imu=kind)

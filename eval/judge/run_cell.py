@@ -15,7 +15,7 @@ from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.eval.judge import flights, second_flight, sources
 from edgeslam_torch.eval.judge.cells import BACKWARDS, CASES, CUT, KIDNAP, SECOND_FLIGHT, VARIANTS, Cell
 from edgeslam_torch.eval.judge.score import Truth, score
-from edgeslam_torch.eval.judge.simulated_imu import IMU_KINDS
+from edgeslam_torch.eval.judge.simulated_imu import IMU_KINDS, RECORDED
 from edgeslam_torch.eval.judge.simulated_telemetry import KINDS, Drawn
 from edgeslam_torch.files.config_file import load_config
 from edgeslam_torch.readers.layouts import read_sequence
@@ -84,6 +84,9 @@ def opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tru
         )
     place = Path(cell.folder)
     source = _recording(place)
+    if cell.imu == RECORDED:
+        return sources.part(source, cell.seed), Truth(place)
+    source = replace(source, telemetry=[], imu=None, imu_readings=None)  # images alone
     if cell.variant in (KIDNAP, BACKWARDS):
         return _reordered(cell, source, folder / "groundtruth.txt")
     if cell.variant == SECOND_FLIGHT:
@@ -91,7 +94,7 @@ def opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tru
     dataset = open_dataset(place)
     if cell.telemetry:
         drawn = Drawn(dataset.truth, dataset.frame_stamps_s, cell.seed)
-        return replace(source, telemetry=KINDS[cell.telemetry](drawn), imu=None, imu_readings=None), Truth(place)
+        return replace(source, telemetry=KINDS[cell.telemetry](drawn)), Truth(place)
     source = _with_imu(cell, source, place)
     truth = Truth(place, place if dataset.depth is not None else None)
     return VARIANTS[cell.variant].applied_to(source, cell.seed) if cell.variant else source, truth
@@ -111,7 +114,7 @@ def _first_flight(cell: Cell, flights_root: Path) -> tuple[Recording, Truth]:
     if cell.course:
         place = flights.flight_folder(flights_root, cell.course, cell.seed)
         return _recording(place), Truth(place)
-    source = _recording(Path(cell.folder))
+    source = replace(_recording(Path(cell.folder)), telemetry=[], imu=None, imu_readings=None)
     return sources.part(source, count=CASES[SECOND_FLIGHT][cell.base]), Truth(Path(cell.folder))
 
 

@@ -22,6 +22,9 @@ _GAPS, _GAP_S = 5, 0.5
 _RANGE = ImuErrors(gyroscope_range_rad_s=0.5, accelerometer_range_m_s2=10.3)
 """Too small for hand-held motion."""
 
+RECORDED = "recorded"
+"""In place of a kind in a cell's name: the recording's own IMU; the seed is the frame from which it starts."""
+
 Simulated = tuple[ImuModel, ImuReadings]
 
 

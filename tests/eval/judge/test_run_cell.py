@@ -17,6 +17,7 @@ from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_traject
 from edgeslam_torch.eval.judge import flights, run_cell
 from edgeslam_torch.eval.judge.cells import VARIANTS, Cell, list_cells
 from edgeslam_torch.eval.judge.score import Truth, score
+from edgeslam_torch.eval.judge.simulated_imu import RECORDED
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.synthetic.flights.courses import COURSES, record_course
 
@@ -106,6 +107,19 @@ def test_run_that_never_moves_scores_a_fixed_position(recording, judged, tmp_pat
 def test_cell_that_cannot_run_says_why(tmp_path):
     with pytest.raises(SourceError, match="no such file or folder"):
         run(tmp_path, Cell("gone", 0, str(tmp_path / "gone")))
+
+
+def test_a_recordings_own_imu_is_a_cell_of_its_own(recording, tmp_path):
+    with_imu = tmp_path / "stairs"
+    shutil.copytree(recording, with_imu)
+    stamps_s = open_dataset(recording).frame_stamps_s
+    t = np.arange(stamps_s[0] - 1.0, stamps_s[-1] + 1.0, 0.01)
+    rows = [f"{s:.6f},0,0,0,0,0,9.81" for s in t]
+    (with_imu / "imu.csv").write_text("\n".join(["stamp_s,gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    for imu, start in (("", 0), (RECORDED, 3)):
+        source, _ = run_cell.opened(Cell("stairs", 3, str(with_imu), imu=imu), tmp_path, tmp_path)
+        assert (source.imu_readings is not None) == bool(imu)
+        assert next(source.decode([])).stamp_s == pytest.approx(stamps_s[start], abs=1e-6)
 
 
 def test_simulated_flight_is_judged_by_its_world(tmp_path, monkeypatch):
