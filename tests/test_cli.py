@@ -379,3 +379,32 @@ def test_pipes_and_devices_are_refused_wherever_they_are_named(edgeslam, recordi
         code, _, err = edgeslam(*words.format(p=name, seq=recording, tmp=tmp_path).split())
         assert (code, len(err.strip().splitlines())) == (1, 1)
         assert "no plain file" in err
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+@pytest.mark.parametrize(
+    "words",
+    [
+        "run {seq} -o {run} --no-report",
+        "eval {run} -g {seq}",
+        "report {run} --overwrite",
+        "compare {run} {run} -g {seq}",
+        "export-map {run} --format occupancy -o {tmp}/map",
+        "export-map {run} --format colmap -o {tmp}/colmap",
+    ],
+)
+def test_a_pipe_in_a_folder_of_somebody_else_is_not_waited_for(edgeslam, recording, tmp_path, words):
+    """In place of each file in turn; what is not needed may be missing."""
+    (recording / "groundtruth.txt").write_text("".join(f"{100 + 0.1 * i} {i} 0 0 0 0 0 1\n" for i in range(6)))
+    (recording / "telemetry.csv").write_text("stamp_s,vgx,vgy,vgz,pitch,roll,yaw,tof\n100,0,0,0,0,0,0,100\n")
+    run = tmp_path / "run"
+    assert edgeslam("run", recording, "-o", run, "--no-report")[0] == 0
+    for path in [*run.iterdir(), *(p for p in recording.rglob("*") if p.is_file())]:
+        content = path.read_bytes()
+        path.unlink()
+        os.mkfifo(path)
+        code, _, err = edgeslam(*words.format(run=run, seq=recording, tmp=tmp_path).split())
+        assert (code == 0) or "error:" in err
+        path.unlink(missing_ok=True)
+        path.write_bytes(content)

@@ -14,6 +14,7 @@ import numpy as np
 
 from edgeslam_torch.atlas.saved import SavedAtlas
 from edgeslam_torch.errors import AtlasError, CalibrationError
+from edgeslam_torch.files.plain import open_plain
 from edgeslam_torch.files.tensor_file import KINDS, Array, Damaged, Entry, read_entries, write_tensors
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.lens import check_camera
@@ -111,7 +112,7 @@ def read_atlas(path: Path) -> SavedAtlas:
 def is_atlas(path: Path) -> bool:
     """Whether a file is an atlas of any version, valid or not, so that a newer one may replace it."""
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             remarks, _ = read_entries(file, {kind: dtype.itemsize for kind, dtype in KINDS.items()})
     except (OSError, ValueError):
         return False

@@ -1,4 +1,4 @@
-"""Files and folders made where others may have left links: nothing outside the folder is ever written to.
+"""Files and folders where others may have left links and pipes: nothing outside is written to, nothing is waited for.
 
 Every file of ours is opened for writing here or in `atomic`. A link at a file's name is replaced, never followed; what
 is no plain file (a device, a pipe, a folder) is refused; a folder of ours within another may not be a link.
@@ -17,6 +17,19 @@ _NO_WAIT = getattr(os, "O_NONBLOCK", 0)
 _COMMON = getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0) | _NO_FOLLOW
 _MODE = 0o666
 """The umask takes away from it."""
+
+
+def open_plain(path: Path) -> BinaryIO:
+    """A file to read that lies in a folder of somebody else; the target of a link is read.
+
+    Raises:
+        OSError: If it cannot be opened or is no plain file, such as a named pipe, which would be waited for.
+    """
+    handle = os.open(path, os.O_RDONLY | _NO_WAIT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0))
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise OSError(errno.EINVAL, "is no plain file", str(path))
+    return os.fdopen(handle, "rb")
 
 
 def check_replaceable(path: Path) -> None:

@@ -10,6 +10,7 @@ import yaml
 
 from edgeslam_torch.errors import CalibrationError
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.plain import open_plain
 from edgeslam_torch.geometry.calibrations.keys import camera_of
 from edgeslam_torch.geometry.calibrations.text import MAX_JSON_BYTES, record_of
 from edgeslam_torch.geometry.camera import PRESETS, Camera
@@ -78,7 +79,8 @@ def _record(path: Path) -> tuple[dict[str, Any], list[str]]:
     size = path.stat().st_size
     if size > MAX_JSON_BYTES:
         raise ValueError(f"{size / 1e6:.0f} MB is too large")
-    return record_of(path.read_bytes())
+    with open_plain(path) as file:
+        return record_of(file.read())
 
 
 @contextmanager

@@ -18,6 +18,7 @@ import numpy as np
 
 from edgeslam_torch.errors import EdgeSlamError, OutputError, SourceError
 from edgeslam_torch.files.appender import Appender
+from edgeslam_torch.files.plain import open_plain
 from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.tasks import Task
@@ -84,7 +85,7 @@ def read_plan(path: Path) -> Iterator[Entry]:
         SourceError: If the file is missing, of another format, or damaged before its end.
     """
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             lines = iter(lambda: file.readline(_MAX_BYTES), b"")
             head = _parsed(next(lines, b""), path, 1)
             if not isinstance(head, dict) or head.get("format") != _HEAD["format"]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_atomically
+from edgeslam_torch.files.plain import open_plain
 from edgeslam_torch.types import Observations
 
 _MAX_BYTES = 1 << 29
@@ -35,7 +36,7 @@ def read_observations(path: Path) -> Observations:
         SourceError: If it is missing or damaged.
     """
     try:
-        with zipfile.ZipFile(path) as packed:
+        with open_plain(path) as plain, zipfile.ZipFile(plain) as packed:
             if sum(member.file_size for member in packed.infolist()) > _MAX_BYTES:
                 raise SourceError(f"{path}: unpacks to more than {_MAX_BYTES >> 20} MiB; it is not read")
         with np.load(path, allow_pickle=False) as file:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from edgeslam_torch.errors import OutputError
-from edgeslam_torch.files.plain import open_shared
+from edgeslam_torch.files.plain import open_plain, open_shared
 from edgeslam_torch.readers.images import image_files
 from edgeslam_torch.readers.video import SUFFIXES as VIDEOS
 
@@ -22,7 +22,7 @@ except ImportError:  # Windows: concurrent runs into one folder are not detected
 
 STATUS = "status.csv"
 SUMMARY = "summary.json"
-_STATUS_BEGIN = "index,stamp_s,status,"
+_STATUS_BEGIN = b"index,stamp_s,status,"
 """Header of the status table in every version; written with the first frame."""
 _SUMMARY_KEYS = frozenset({"version", "frames", "statuses"})
 _RECORDING = ("rgb.txt", "rgb", "mav0", "cam0", "data.csv", "sensor.yaml", "ost.yaml", "telemetry.csv")
@@ -61,13 +61,14 @@ def _foreign(folder: Path, outputs: Collection[str]) -> str | None:
 def _is_run(folder: Path) -> bool:
     """Whether a run wrote here, including older versions and killed runs."""
     try:
-        with (folder / STATUS).open(encoding="utf-8") as file:
+        with open_plain(folder / STATUS) as file:
             if file.readline(200).startswith(_STATUS_BEGIN):
                 return True
-    except (OSError, UnicodeDecodeError):
+    except OSError:
         pass
     try:
-        summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+        with open_plain(folder / SUMMARY) as file:
+            summary = json.loads(file.read())
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(summary, dict) and summary.keys() >= _SUMMARY_KEYS

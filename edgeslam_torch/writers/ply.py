@@ -7,6 +7,7 @@ import numpy as np
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_atomically
+from edgeslam_torch.files.plain import open_plain
 from edgeslam_torch.types import FloatArray, PointCloud
 
 VERTEX = np.dtype(
@@ -90,7 +91,7 @@ def read_ply(path: Path) -> PointCloud:
         SourceError: If the file is missing, no PLY, of an unsupported kind or cut off.
     """
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             kind, count, dtype = _read_header(file, path)
             body = file.read()
     except OSError as error:

@@ -2,11 +2,13 @@
 
 import csv
 import html
+import io
 from pathlib import Path
 
 import numpy as np
 
 from edgeslam_torch.eval.report.line_drawings import chart, view
+from edgeslam_torch.files.plain import open_plain
 
 _MOMENTS = "moments.csv"
 _EXITS = "exits.csv"
@@ -42,8 +44,8 @@ def flight_section(folder: Path | None) -> str:
 
 def _rows(path: Path, needed: tuple[str, ...] = _NEEDED) -> list[dict[str, str]]:
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+        with open_plain(path) as file:
+            rows = list(csv.DictReader(io.TextIOWrapper(file, "utf-8", newline="")))
     except (OSError, UnicodeDecodeError, csv.Error):
         return []
     return rows if rows and all(name in rows[0] for name in needed) else []

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.inputs.run_folder import is_supported, read_status
+from edgeslam_torch.files.plain import open_plain
 from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
@@ -103,7 +104,8 @@ def load_run(
     folder = Path(os.path.abspath(folder))
     try:
         summary = read_mapping(folder / "summary.json", "JSON", SourceError)
-        rows = np.loadtxt(folder / "trajectory.txt", ndmin=2)
+        with open_plain(folder / "trajectory.txt") as file:
+            rows = np.loadtxt(file, ndmin=2)
         recording = source if source is not None else str(folder.resolve() / summary["source"]["path"])
         poses = {round(float(row[0]), 6): _pose(row) for row in rows}
         trusted = _trusted_stamps(folder)

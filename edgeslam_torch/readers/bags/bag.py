@@ -177,6 +177,9 @@ class Bag:
 
     @contextmanager
     def _opened(self, file: Path) -> Iterator[Any]:
+        for part in (file, *(file.iterdir() if file.is_dir() else ())):
+            if part.exists() and not (part.is_file() or part.is_dir()):  # its readers would wait for a pipe
+                raise SourceError(f"{part}: is no plain file")
         with needs_extra("bags", f"{self.path}: a ROS bag"):
             ros1, ros2 = readers()
         with self._no_damage(str(self.path)):

@@ -3,6 +3,8 @@
 import re
 from pathlib import Path
 
+from edgeslam_torch.files.plain import open_plain
+
 _HEAD_BYTES = 4096
 _NEEDED = "columns stamp_s, 'vgx (m/s)', 'vgy (m/s)', 'vgz (m/s)', 'pitch (deg)', 'roll (deg)', 'yaw (deg)', 'tof (m)'"
 _BINARY = (
@@ -30,8 +32,8 @@ _MAVLINK = re.compile(rb"^.{8}[\xfe\xfd]", re.S)
 def foreign_log(path: Path) -> str | None:
     """Kind of a foreign log and how to convert it, in one line; None for other files."""
     try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES) if path.is_file() else b""
+        with open_plain(path) as file:
+            head = file.read(_HEAD_BYTES)
     except OSError:
         return None
     for magic, what, where in _BINARY:

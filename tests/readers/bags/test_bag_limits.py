@@ -1,6 +1,7 @@
 """Bags made to hang, to take memory or to run code; and formats that only look strange."""
 
 import bz2
+import os
 import shutil
 import sqlite3
 from pathlib import Path
@@ -64,6 +65,15 @@ def test_a_split_recording_without_metadata_is_read_in_order(tmp_path, suffix):
         shutil.copy(tmp_path / f"y{suffix}", folder)
         with pytest.raises(SourceError, match="do not follow each other"):
             open_source(folder)
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("name", ["b.db3", "b.mcap"])
+def test_a_pipe_in_a_bags_folder_is_refused(tmp_path, name):
+    bags.write_ros2(tmp_path / "bag", _pictures(0, 3))
+    os.mkfifo(tmp_path / "bag" / name)
+    with pytest.raises(SourceError, match="no plain file"):
+        open_source(tmp_path / "bag")
 
 
 def test_a_folder_of_pictures_with_a_bag_in_it_is_no_bag(tmp_path):
