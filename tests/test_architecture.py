@@ -50,7 +50,7 @@ def sources() -> list[Path]:
 def statements(node: ast.AST) -> Iterator[ast.stmt]:
     """Statements inside a node at any depth, except for the type checker's own."""
     for inner in ast.iter_child_nodes(node):
-        if isinstance(inner, ast.If) and "TYPE_CHECKING" in ast.unparse(inner.test):
+        if isinstance(inner, ast.If) and getattr(inner.test, "id", "") == "TYPE_CHECKING":
             continue
         if isinstance(inner, ast.stmt):
             yield inner

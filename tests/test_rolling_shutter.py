@@ -29,20 +29,14 @@ def rolled(world, camera, flight, k, readout_s):
 @pytest.mark.slow
 def test_the_readout_of_a_phone_costs_little_on_a_slow_way():
     """20 ms at .4 m/s and 35 degrees a second: the row that is read last is 4 px late."""
-    camera = simulated_camera(480, 360)
-    world, flight, _ = flown(COURSES["room"], 0, 8.0)
-    error = {}
-    for readout_s in (0.0, 0.02):
-        slam = EdgeSlam(camera, SlamConfig())
-        for k in range(len(flight.stamps_s)):
-            slam.step(Frame(k, float(flight.stamps_s[k]), rolled(world, camera, flight, k, readout_s)))
-        slam.finish()
-        seen, true = slam.trajectory()[1][:, :3, 3], flight.T_w_c[:, :3, 3]
-        found = umeyama(seen, true, "sim3")
-        error[readout_s] = float(np.sqrt(np.mean(np.sum((found.points(seen) - true) ** 2, axis=1))))
-        support = slam.support()
-        assert support.supported.all() and not support.others()
-        slam.close()
-    path_m = float(np.linalg.norm(np.diff(flight.T_w_c[:, :3, 3], axis=0), axis=1).sum())
-    assert error[0.0] < 0.005 * path_m  # .0087 and .0101 m of 2.9
-    assert error[0.02] < 0.006 * path_m
+    camera, slam = simulated_camera(480, 360), EdgeSlam(simulated_camera(480, 360), SlamConfig())
+    world, flight, _ = flown(COURSES["room"], 0, 6.0)
+    for k in range(len(flight.stamps_s)):
+        slam.step(Frame(k, float(flight.stamps_s[k]), rolled(world, camera, flight, k, 0.02)))
+    slam.finish()
+    seen, true = slam.trajectory()[1][:, :3, 3], flight.T_w_c[:, :3, 3]
+    support, error = slam.support(), umeyama(seen, true, "sim3").points(seen) - true
+    slam.close()
+    assert support.supported.all() and not support.others()
+    path_m = float(np.linalg.norm(np.diff(true, axis=0), axis=1).sum())
+    assert float(np.sqrt(np.mean(np.sum(error**2, axis=1)))) < 0.006 * path_m

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import json
 import re
+from functools import cache
 from pathlib import Path
 
 import griffe
@@ -50,14 +51,19 @@ UNITS = {
 """Ends of names, longest first, and the unit that they state."""
 
 
+@cache
+def _package() -> griffe.Object:
+    """The package as read from its files."""
+    return griffe.load("edgeslam_torch", search_paths=[str(ROOT)], submodules=True)
+
+
 def settings_page() -> str:
     """Every setting of `SlamConfig` with its default, unit and reason.
 
     Raises:
         ValueError: If one has no reason.
     """
-    package = griffe.load("edgeslam_torch", search_paths=[str(ROOT)], submodules=True)
-    top, sections = [], []
+    package, top, sections = _package(), [], []
     for field in dataclasses.fields(SlamConfig):
         value = getattr(SlamConfig(), field.name)
         if not dataclasses.is_dataclass(value):
@@ -145,8 +151,7 @@ def _plain(text: str) -> str:
 
 def api_pages() -> dict[str, str]:
     """Page of the site: the names that it documents, in Markdown for mkdocstrings."""
-    package = griffe.load("edgeslam_torch", search_paths=[str(ROOT)], submodules=True, resolve_aliases=False)
-    found = {}
+    package, found = _package(), {}
     for page, name in PACKAGES.items():
         module = package[name.partition(".")[2]] if "." in name else package
         # A package whose ``__all__`` is computed has its public names in its stub.

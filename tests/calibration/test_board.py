@@ -74,10 +74,10 @@ def aprilgrid(columns=6, rows=5, side=100, gap=30, border=2, upwards=True):
     return picture
 
 
-@pytest.mark.parametrize(("border", "upwards", "turned"), [(2, True, 0), (1, False, 0), (2, True, 2)])
+@pytest.mark.parametrize(("border", "upwards", "turned"), [(1, False, 0), (2, True, 2)])
 def test_aprilgrid_is_found_whatever_its_order_and_border(rng, border, upwards, turned):
     picture = np.rot90(aprilgrid(border=border, upwards=upwards), turned)
-    result = calibrate(views(rng, picture, 10, width_m=0.4), Board(6, 5, tag_spacing=0.3))
+    result = calibrate(views(rng, picture, 6, width_m=0.4), Board(6, 5, tag_spacing=0.3))
     assert result.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
     assert result.rms_px < 0.3
 

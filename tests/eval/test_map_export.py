@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
+from edgeslam_torch.cli import main
 from edgeslam_torch.commands import export_map
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.geometry.camera import PRESETS, Camera
@@ -269,3 +270,35 @@ def test_nothing_left_is_said(run_folder: Callable[..., Path], tmp_path: Path) -
     run_folder(tmp_path / "a")
     with pytest.raises(EdgeSlamError, match="no point is left"):
         export(tmp_path / "a", "--format", "ply", "--max-sigma", 1e-9)
+
+
+KNOWN = {"source": "edges", "sigma_deg": 1.24}
+
+
+@pytest.mark.parametrize(
+    ("form", "file", "up"),
+    [
+        *[(*form, KNOWN) for form in (("ply", ""), ("pcd", ""), ("las", ""), ("colmap", "points3D.txt"))],
+        *[(*form, None) for form in (("pcd", ""), ("las", ""), ("colmap", "images.txt"))],
+        *[("ply", "", up) for up in ({"source": "unknown", "sigma_deg": None}, [KNOWN], {"source": "edges"})],
+        ("ply", "", {"source": 3, "sigma_deg": "x"}),
+    ],
+)
+def test_every_exported_map_says_whether_z_is_up(
+    run_folder: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    form: str,
+    file: str,
+    up: object,
+) -> None:
+    if form == "las":
+        pytest.importorskip("laspy")
+    run_folder(tmp_path / "run", points=100)
+    save_camera(tmp_path / "run" / "camera.yaml", PRESETS["tum_fr1"])
+    summary = tmp_path / "run" / "summary.json"
+    summary.write_text(json.dumps({**json.loads(summary.read_text()), "up": up}))
+    said = "z up by edges, sigma 1.2 degrees" if up is KNOWN else "up is not known"
+    assert main(["export-map", str(tmp_path / "run"), "--format", form, "-o", str(tmp_path / "out")]) == 0
+    assert said in capsys.readouterr().out
+    assert said.encode() in (tmp_path / "out" / file if file else tmp_path / "out").read_bytes()[:10000]

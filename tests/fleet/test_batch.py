@@ -112,14 +112,6 @@ def test_killed_process_costs_its_flight_one_attempt(tmp_path, recordings):
     assert states(rows)["b"] == "done"
 
 
-def test_half_written_result_is_no_result(tmp_path, recordings):
-    starter = Starter()
-    batch(tmp_path, recordings, starter)
-    (tmp_path / "out" / "jobs" / "b" / "result.json").write_text('{"key": ')
-    batch(tmp_path, recordings, starter)
-    assert sorted(starter.started) == ["a", "b", "b", "c"]
-
-
 def test_interrupted_batch_leaves_a_table_of_what_is_finished(tmp_path, recordings):
     def interrupt(text):
         raise KeyboardInterrupt

@@ -131,44 +131,31 @@ def test_bad_description_is_one_line(tmp_path, words):
     assert "\n" not in str(caught.value) and "net." in str(caught.value)
 
 
-def test_fixed_size_differs_from_the_description(tmp_path):
-    path = green_network(tmp_path / "net.onnx", size=(64, 96))
-    with pytest.raises(WeightsError, match="images of 64x96"):
-        open_depth(describe(path, f'gives = "metres"\n{SIZE}'))
+def always(number):
+    """A network that gives one number, whatever it sees."""
+    nodes = [node("Mul", "depth none", "zero"), node("Add", "zero number", "out")]
+    return {"nodes": nodes, "output": "out", "constants": {"none": 0.0, "number": number}}
 
 
-def test_graph_with_four_channels_is_no_camera_network(tmp_path):
-    with pytest.raises(WeightsError, match=r"expected \[1, 3, H, W\]"):
-        open_depth(describe(green_network(tmp_path / "net.onnx", channels=4), f'gives = "metres"\n{SIZE}'))
-
-
-def test_size_that_the_network_does_not_take_is_one_line(tmp_path, image):
-    constants = {"rows": np.array([1, 1, 126, -1], np.int64)}
-    path = green_network(tmp_path / "net.onnx", [node("Reshape", "depth rows", "out")], "out", constants=constants)
-    with pytest.raises(WeightsError, match="cannot be run on 112x112 pixels"):
-        open_depth(describe(path, f'gives = "metres"\n{SIZE}'))
+ROWS = {"nodes": [node("Reshape", "depth rows", "out")], "output": "out"}
 
 
 @pytest.mark.parametrize(
-    ("number", "gives", "words"),
+    ("network", "text", "words"),
     [
-        (np.nan, "metres", "gives no depth"),
-        (-9.0, "metres", "gives no depth"),
-        (0.0, "relative_inverse", "gives no depth"),
+        ({"size": (64, 96)}, SIZE, "images of 64x96"),
+        ({"size": (4096, 4096)}, "", "input_height must be from"),
+        ({"channels": 4}, SIZE, r"expected \[1, 3, H, W\]"),
+        ({**ROWS, "constants": {"rows": np.array([1, 1, 126, -1])}}, SIZE, "cannot be run on 112x112 pixels"),
+        (always(np.nan), SIZE, "gives no depth"),
+        (always(-9.0), SIZE, "gives no depth"),
+        (always(2.0), SIZE, "the same depth whatever it sees"),
     ],
 )
-def test_network_without_depth_is_rejected(tmp_path, number, gives, words):
-    nodes = [node("Mul", "depth none", "zero"), node("Add", "zero number", "bad")]
-    path = green_network(tmp_path / "net.onnx", nodes, "bad", constants={"none": 0.0, "number": number})
+def test_network_that_cannot_give_depth_is_one_line(tmp_path, network, text, words):
+    path = describe(green_network(tmp_path / "net.onnx", **network), f'gives = "metres"\n{text}')
     with pytest.raises(WeightsError, match=words):
-        open_depth(describe(path, f'gives = "{gives}"\n{SIZE}'))
-
-
-def test_network_with_constant_output_is_rejected(tmp_path):
-    nodes = [node("Mul", "depth none", "zero"), node("Add", "zero number", "same")]
-    path = green_network(tmp_path / "net.onnx", nodes, "same", constants={"none": 0.0, "number": 2.0})
-    with pytest.raises(WeightsError, match="the same depth whatever it sees"):
-        open_depth(describe(path, f'gives = "metres"\n{SIZE}'))
+        open_depth(path)
 
 
 def test_non_finite_pixels_are_unknown(tmp_path, image):
@@ -184,6 +171,7 @@ def test_non_finite_pixels_are_unknown(tmp_path, image):
 def test_constant_output_gives_no_relative_depth():
     assert np.isnan(relative_depth(np.full((4, 4), 3.0, np.float32))).all()
     assert np.isnan(relative_depth(np.full((4, 4), np.nan, np.float32))).all()
+    assert np.isnan(relative_depth(np.zeros((4, 4), np.float32))).all()
 
 
 # -- presets -------------------------------------------------------------------------------------------------------
@@ -312,8 +300,3 @@ def test_record_of_odd_types_is_one_line(tmp_path, record):
     onnx.save(model, tmp_path / "net.onnx")
     with pytest.raises(WeightsError):
         open_depth(tmp_path / "net.onnx")
-
-
-def test_fixed_size_beyond_the_largest_is_one_line(tmp_path):
-    with pytest.raises(WeightsError, match="input_height must be from"):
-        open_depth(describe(green_network(tmp_path / "net.onnx", size=(4096, 4096)), 'gives = "metres"\n'))

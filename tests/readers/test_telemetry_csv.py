@@ -270,7 +270,7 @@ def _reads_or_refuses(folder, data):
     assert all(b > a for a, b in zip(stamps, stamps[1:], strict=False))
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(lines, max_size=12))
 def test_any_csv_is_read_or_refused(tmp_path, rows):
     _reads_or_refuses(tmp_path, "\n".join([",".join(HEADER), *rows]).encode("utf-8", "surrogatepass"))

@@ -142,7 +142,7 @@ def test_simulated_flight_is_judged_by_its_world(tmp_path, monkeypatch):
     assert surfaces(floor) == pytest.approx([0.25], abs=0.01), "the floor is at height 0, a rug 8 mm above"
 
 
-@pytest.mark.parametrize("kind", flights.NONE)
+@pytest.mark.parametrize("kind", ["noise", "black", pytest.param("frozen", marks=pytest.mark.slow)])
 def test_nothing_to_see_is_a_source_like_any_other(kind):
     source = flights.nothing_to_see(kind, 1)
     frames = [next(frames) for frames in [source.frames()] for _ in range(2)]
@@ -199,18 +199,18 @@ def test_second_flight_is_in_the_map_of_the_first_and_judged_against_it(recordin
 
 
 def test_a_further_flight_has_another_path_through_the_same_world(tmp_path, monkeypatch):
-    monkeypatch.setitem(COURSES, "corridor", replace(COURSES["corridor"], seconds=0.4))
+    monkeypatch.setitem(COURSES, "corridor", replace(COURSES["corridor"], seconds=0.2))
     assert flights.main("corridor", 3, tmp_path / "again", 1) == 0
     world, first, _ = flights.flown(COURSES["corridor"], 3, seconds=0.4)
     again = open_dataset(tmp_path / "again").truth
-    assert len(again.stamps_s) == 8
+    assert len(again.stamps_s) == 4
     assert np.linalg.norm(again.positions[0] - first.T_w_c[0, :3, 3]) > 0.1
     assert world.clearance(again.positions[0]) > 0.2, "in free space of that world"
 
 
 @pytest.mark.slow
 def test_a_further_flight_through_the_building_takes_off_from_the_same_place(tmp_path, monkeypatch):
-    monkeypatch.setitem(COURSES, "building", replace(COURSES["building"], seconds=6.0, rate_hz=2.0))
+    monkeypatch.setitem(COURSES, "building", replace(COURSES["building"], seconds=2.0, rate_hz=2.0))
     assert flights.main("building", 0, tmp_path / "again", 1) == 0
     first = flights.flown(COURSES["building"], 0)[1].T_w_c[:, :3, 3]
     apart = np.linalg.norm(open_dataset(tmp_path / "again").truth.positions - first, axis=1)
@@ -263,14 +263,12 @@ def test_folder_that_is_not_there_is_named(tmp_path):
         list_cells(tmp_path / "gone", "base", [0])
 
 
-def test_a_cut_shows_one_world_and_then_the_next(tmp_path, monkeypatch):
+def test_a_cut_shows_one_world_and_then_the_next(recording, tmp_path, monkeypatch):
     asked = []
 
     def folder(root, course, seed):
         asked.append((course, seed))
-        if not (root / f"{seed}").is_dir():
-            record_course(root / f"{seed}", COURSES[course], seed, seconds=0.3)
-        return root / f"{seed}"
+        return shutil.copytree(recording, root / f"{seed}", dirs_exist_ok=True)
 
     monkeypatch.setattr(flights, "flight_folder", folder)
     monkeypatch.setattr(run_cell, "CUT_FRAMES", 4)

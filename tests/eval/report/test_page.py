@@ -179,12 +179,10 @@ def test_a_loss_that_was_made_good_is_not_told_as_a_contradiction(run: Path) -> 
     assert "never lost" in story and "Every frame was tracked" in story
 
 
-@pytest.mark.parametrize(
-    "key", ["offered", "left_out", "frames", "fps", "peak_rss_mb", "scale", "source", "lost_events", "pieces"]
-)
 @pytest.mark.parametrize("value", [None, "text", [1], {"value": []}, -1, 10**400, True])
-def test_summary_of_wrong_types_is_a_page_all_the_same(run: Path, key: str, value: Any) -> None:
-    page = Page(write_report(with_summary(run, **{key: value}), judge_map=False))
+@pytest.mark.parametrize("keys", ["offered frames peak_rss_mb source pieces", "left_out fps scale lost_events"])
+def test_summary_of_wrong_types_is_a_page_all_the_same(run: Path, keys: str, value: Any) -> None:
+    page = Page(write_report(with_summary(run, **dict.fromkeys(keys.split(), value)), judge_map=False))
     assert page.data["title"]
 
 

@@ -103,6 +103,7 @@ def worst_page(tmp_path_factory: pytest.TempPathFactory, run_folder: Callable[..
     return write_report(folder, truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [320, 390, 1280])
 def test_no_text_of_a_run_makes_the_page_scroll_sideways(worst_page: Path, browser: Browser, width: int) -> None:
     browser.open(worst_page, width=width, height=844, mobile=width < 700)
