@@ -109,15 +109,24 @@ class Places:
         points = np.asarray(p_w, dtype=np.float64).reshape(-1, self._size)
         if len(points) == 0:
             return
-        (T, scale), self._views = views.now, views
+        (T, _), self._views = views.now, views
         view = np.full(len(points), len(T) - 1)
         if nearest and len(T) > 1:  # the last one on a tie: the map may have been corrected there
             away = np.linalg.norm(points[:, None] - T[:0:-1, : self._size, 3], axis=2)
             view -= away.argmin(axis=1)
-        step = np.zeros((len(points), 3))
-        step[:, : self._size] = points - T[view, : self._size, 3]
-        local = np.einsum("nji,nj->ni", T[view, :3, :3], step) / scale
-        self._view, self._local = np.concatenate([self._view, view]), np.concatenate([self._local, local])
+        self._view = np.concatenate([self._view, view])
+        self._local = np.concatenate([self._local, self._in_views(view, points)])
+
+    def move(self, p_w: FloatArray) -> None:
+        """Estimate the points anew, ``(N, size)``; they stay tied to their views."""
+        self._local = self._in_views(self._view, p_w)
+
+    def _in_views(self, view: IntArray, p_w: FloatArray) -> FloatArray:
+        """Points ``(N, size)`` in the frames of views ``(N,)``, in the unit of the beginning."""
+        T, scale = self._views.now
+        step = np.zeros((len(p_w), 3))
+        step[:, : self._size] = p_w - T[view, : self._size, 3]
+        return np.asarray(np.einsum("nji,nj->ni", T[view, :3, :3], step) / scale)
 
     @property
     def p_w(self) -> FloatArray:

@@ -1,8 +1,9 @@
-"""Exits: openings of a door's width in a wall, with free space on both sides.
+"""Detection of openings of a door's width in a wall.
 
 Posters, closed doors and window panes are solid in depth and leave no opening. False openings are rejected by two more
 conditions: collinear walls on both sides, and space that widens in front and behind (two cupboards facing each other
-across a corridor fail).
+across a corridor fail). Free space is carved only up to depth less two standard deviations, so a door beside the path,
+seen at a grazing angle in a few frames, stays mostly unknown: such an opening is detected, too, but leads nowhere yet.
 """
 
 from collections.abc import Iterator
@@ -27,8 +28,10 @@ _BESIDE_M = 0.2
 _WIDER_M = 0.3
 """Minimum widening of the space on either side; walls that bulge by a cell or two make no door of a corridor."""
 _FREE_SHARE, _SOLID_SHARE = 0.8, 0.3
-PARTLY_FREE = 0.3
-"""Minimum share of free cells in a candidate."""
+_ROOM_SHARE = 0.5
+"""Minimum share of free cells in front of an opening that leads nowhere yet."""
+_PARTLY_FREE = 0.3
+"""Minimum share of free cells in any opening."""
 _SAME_M = 0.5
 """Openings closer than this are the same."""
 
@@ -44,20 +47,19 @@ class Gap:
     width_m: float
     wall_m: float
     """Length of collinear wall at both sides together, a measure of confidence [m]."""
+    leads: bool
+    """Whether space is known on both sides; depth smears frames into their doors, so some cells may not be free."""
     is_free: bool
-    """Whether all of its cells are free."""
+    """Whether it leads on and all of its cells are free."""
 
 
 def openings(grids: list[WallGrid]) -> list[Gap]:
-    """Openings in walls, from grids of `along_walls`; one per row of a wall.
-
-    Includes partly free ones with space on both sides, since depth smears frames into their doors.
-    """
-    found = [_gap(grid, t, *ends) for grid in grids for t, *ends in jambs(grid)]
-    return [gap for gap in found if gap is not None]
+    """Openings in walls, from grids of `along_walls`, the most confident first."""
+    found = [_gap(grid, t, *ends) for grid in grids for t, *ends in _jambs(grid)]
+    return _distinct([gap for gap in found if gap is not None])
 
 
-def jambs(grid: WallGrid) -> Iterator[tuple[int, int, int]]:
+def _jambs(grid: WallGrid) -> Iterator[tuple[int, int, int]]:
     """Gaps between wall segments: row, last cell of the one segment, first cell of the other."""
     least = _WALL_SHARE * NARROWEST_M / grid.cell_m
     for t in np.flatnonzero(grid.wall[2:-2].sum(1) >= least) + 2:
@@ -67,27 +69,11 @@ def jambs(grid: WallGrid) -> Iterator[tuple[int, int, int]]:
                 yield int(t), int(low), int(high)
 
 
-def is_in_line(grid: WallGrid, t: int, low: int, high: int) -> bool:
-    """Whether an opening has enough collinear wall."""
-    return _alongside_m(grid, t, low, high) >= _WALL_SHARE * (high - low + 1) * grid.cell_m
-
-
-def band(grid: WallGrid, t: int, side: int) -> np.ndarray:
+def _band(grid: WallGrid, t: int, side: int) -> np.ndarray:
     """Rows of the band `_BEYOND_M` on one side of the wall."""
     near, far = (round(x / grid.cell_m) for x in _BEYOND_M)
     rows = t + side * np.arange(near, far + 1)
     return np.asarray(rows[(rows >= 0) & (rows < len(grid.free))])
-
-
-def gap_of(grid: WallGrid, t: int, low: int, high: int) -> Gap:
-    """The opening between two cells of a row, centred in the thickness of the wall."""
-    width = (high - low + 1) * grid.cell_m  # partly covered end cells are occupied: half of each is open
-    rows = np.arange(t - 1, t + 2)
-    beside = grid.upright[rows, max(0, low - 2) : low].any(1) | grid.upright[rows, high : high + 2].any(1)
-    centre = grid.at(0.5 * (low + high - 1), float(rows[beside].mean()) if beside.any() else float(t))
-    away = float((centre - grid.centre_w) @ grid.left_w)
-    normal = grid.left_w * (1.0 if away >= 0 else -1.0)
-    return Gap(centre, normal, width, _alongside_m(grid, t, low, high), bool(_inside(grid, t, low, high).all()))
 
 
 def _alongside_m(grid: WallGrid, t: int, low: int, high: int) -> float:
@@ -96,34 +82,40 @@ def _alongside_m(grid: WallGrid, t: int, low: int, high: int) -> float:
     return float(grid.cell_m * (wall[max(0, low - reach) : low].sum() + wall[high : high + reach].sum()))
 
 
-def _inside(grid: WallGrid, t: int, low: int, high: int) -> np.ndarray:
-    """Free cells of an opening without its end cells, which may be unknown."""
-    return grid.free[t - 1 : t + 2, low + 1 : high - 1]
-
-
 def _gap(grid: WallGrid, t: int, low: int, high: int) -> Gap | None:
-    """The opening between two cells of a row, if it passes all tests."""
-    if _inside(grid, t, low, high).mean() < PARTLY_FREE:
+    """The opening between two cells of a row, centred in the thickness of the wall, if it passes all tests."""
+    inside = np.s_[t - 1 : t + 2, low + 1 : high - 1]  # without its end cells, which may be unknown
+    width, wall_m = (high - low + 1) * grid.cell_m, _alongside_m(grid, t, low, high)
+    if grid.free[inside].mean() < _PARTLY_FREE or wall_m < _WALL_SHARE * width:
         return None
-    if not all(_leads(grid, t, low, high, side) and _widens(grid, t, low, high, side) for side in (-1, 1)):
+    leads = _in_a_wall(grid, t, low, high) and all(
+        _before(grid, t, low, high, side) >= _FREE_SHARE and _widens(grid, t, low, high, side) for side in (-1, 1)
+    )
+    near = -1 if t > 0.5 * (len(grid.free) - 1) else 1
+    closed = grid.solid[inside].any(0).mean() > _SOLID_SHARE
+    if not leads and (closed or _before(grid, t, low, high, near) < _ROOM_SHARE):
         return None
-    if not (_in_a_wall(grid, t, low, high) and is_in_line(grid, t, low, high)):
-        return None
-    return gap_of(grid, t, low, high)
+    # Partly covered end cells are occupied: half of each is open.
+    rows = np.arange(t - 1, t + 2)
+    beside = grid.upright[rows, max(0, low - 2) : low].any(1) | grid.upright[rows, high : high + 2].any(1)
+    centre = grid.at(0.5 * (low + high - 1), float(rows[beside].mean()) if beside.any() else float(t))
+    away = float((centre - grid.centre_w) @ grid.left_w)
+    normal = grid.left_w * (1.0 if away >= 0 else -1.0)
+    return Gap(centre, normal, width, wall_m, leads, leads and bool(grid.free[inside].all()))
 
 
-def _leads(grid: WallGrid, t: int, low: int, high: int, side: int) -> bool:
-    """Whether one side of the wall is free."""
+def _before(grid: WallGrid, t: int, low: int, high: int, side: int) -> float:
+    """Share of free cells on one side of the wall."""
     fifth = (high - low) // 5
-    before = grid.free[band(grid, t, side), low + fifth : high - fifth]
-    return before.size > 0 and float(before.mean()) >= _FREE_SHARE
+    cells = grid.free[_band(grid, t, side), low + fifth : high - fifth]
+    return float(cells.mean()) if cells.size else 0.0
 
 
 def _widens(grid: WallGrid, t: int, low: int, high: int, side: int) -> bool:
     """Whether the non-occupied space on one side is wider than the opening."""
     middle = (low + high) // 2
     widths = []
-    for row in grid.solid[band(grid, t, side)]:
+    for row in grid.solid[_band(grid, t, side)]:
         left, right = np.flatnonzero(row[: middle + 1]), np.flatnonzero(row[middle:])
         ends = left[-1] if len(left) else -1, middle + right[0] if len(right) else len(row)
         widths.append(ends[1] - ends[0] - 1)
@@ -138,15 +130,15 @@ def _in_a_wall(grid: WallGrid, t: int, low: int, high: int) -> bool:
     width = round(_BESIDE_M / grid.cell_m)
     ends = slice(max(0, low - width), low), slice(high, high + width)
     closed = np.array(
-        [[grid.solid[band(grid, t, side), end].mean() >= _SOLID_SHARE for end in ends] for side in (-1, 1)]
+        [[grid.solid[_band(grid, t, side), end].mean() >= _SOLID_SHARE for end in ends] for side in (-1, 1)]
     )
     return not (closed.all(axis=0).any() or closed.all(axis=1).any())
 
 
-def distinct(found: list[Gap]) -> list[Gap]:
-    """Non-maximum suppression by the length of collinear wall; the most confident first."""
+def _distinct(found: list[Gap]) -> list[Gap]:
+    """Non-maximum suppression: what leads on first, then by the length of collinear wall."""
     kept: list[Gap] = []
-    for gap in sorted(found, key=lambda g: -g.wall_m):
+    for gap in sorted(found, key=lambda g: (not g.is_free, not g.leads, -g.wall_m)):
         if all(np.linalg.norm(gap.centre_w - other.centre_w) > _SAME_M for other in kept):
             kept.append(gap)
     return kept

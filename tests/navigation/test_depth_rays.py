@@ -1,4 +1,4 @@
-"""Aperture hypotheses against images of a wall with a known opening."""
+"""Rays of depth at a wall with a known opening."""
 
 import math
 
@@ -9,8 +9,9 @@ from views import moved
 from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import MapViews
-from edgeslam_torch.navigation.openings.aperture_hypotheses import aperture_hypotheses
+from edgeslam_torch.navigation.openings.depth_rays import DepthRays
 from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
+from edgeslam_torch.navigation.openings.exits import openings
 from edgeslam_torch.navigation.openings.wall_frame import Walls, along_walls
 
 K = np.array([[60.0, 0.0, 60.0], [0.0, 60.0, 45.0], [0.0, 0.0, 1.0]])
@@ -54,7 +55,9 @@ def walls(opening=(-0.45, 0.45), free_beyond=False, shut=0.0):
 
 
 def seen(known, view, here=(0.0, 0.0)):
-    return aperture_hypotheses(along_walls(known, np.array(here)), view, np.array(here))
+    rays = DepthRays.of(view)
+    found = openings(along_walls(known, np.array(here)))
+    return [gap for gap in found if rays.pass_(gap.centre_w, gap.normal_w, gap.width_m)]
 
 
 @pytest.mark.parametrize(("x", "y", "yaw_deg"), [(0.5, 0.0, 0.0), (0.8, -0.6, 30.0), (0.3, 1.2, -40.0)])
@@ -84,8 +87,10 @@ def test_closed_openings_yield_no_hypothesis(case, known, opening, behind_m):
 
 def test_no_hypothesis_behind_the_camera_or_far_away():
     assert seen(walls(), picture(looking(0.5, 0.0, math.pi), (-0.45, 0.45), 2.0)) == []
-    far = looking(-2.5, 0.0, 0.0)
-    assert seen(walls(), picture(far, (-0.45, 0.45), 2.0), (-2.5, 0.0)) == []
+    watch, view = ExitTracker(), picture(looking(-2.5, 0.0, 0.0), (-0.45, 0.45), 2.0)
+    for k in range(4):
+        watch.look(walls(), DroneState(0.5 * k, np.array([-2.5, 0.0, HEIGHT_M]), 0.0, np.zeros(3), view=view))
+    assert watch.candidates == ()
 
 
 @pytest.mark.parametrize("tilt_deg", [60.0, 90.0])
