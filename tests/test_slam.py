@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from point_map import check_map
-from rendered import CAMERA, film, patchwork, sideways, stairs_world
+from rendered import CAMERA, film, panels, patchwork, sideways, stairs_world
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.config import DepthConfig, OrbConfig, SlamConfig
@@ -37,12 +37,6 @@ def go(frames, depth=None, config=NO_NETWORK):
     slam.finish()
     check_map(slam.map)
     return slam, outputs
-
-
-@lru_cache(maxsize=1)
-def panels():
-    """40 images past panels at many depths: 1.2 m sideways, turning by 9 degrees."""
-    return film(stairs_world(), CAMERA, sideways(40, 0.03, turn_rad=0.004), step_s=1 / 30)
 
 
 @lru_cache(maxsize=1)
@@ -570,6 +564,7 @@ def test_two_pieces_are_joined_when_the_second_comes_to_the_place_of_the_first()
     assert ate(after, long.T_w_c[order][told[0].index :]) < 0.01
 
 
+@pytest.mark.slow
 def test_known_ground_gets_no_keyframes():
     """There, back and there again, slowly: the third pass sees nothing that the first two have not seen."""
     there = list(range(0, len(panels().frames), 2))

@@ -1,6 +1,6 @@
 """Short rendered flights with known poses and depth, made once per test session."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -40,9 +40,20 @@ class RenderedFlight:
 
         return depth
 
+    def first(self, count):
+        """The flight up to its ``count``-th image."""
+        frames, depth_m, T_w_c = self.frames[:count], self.depth_m[:count], self.T_w_c[:count]
+        return replace(self, frames=frames, depth_m=depth_m, T_w_c=T_w_c)
+
     def with_images(self, change):
         """Frames whose images are what ``change(index, image)`` makes of them."""
         return [Frame(f.index, f.stamp_s, change(f.index, f.image)) for f in self.frames]
+
+
+@lru_cache(maxsize=1)
+def panels():
+    """40 images past panels at many depths: 1.2 m sideways, turning by 9 degrees."""
+    return film(stairs_world(), CAMERA, sideways(40, 0.03, turn_rad=0.004), step_s=1 / 30)
 
 
 @lru_cache(maxsize=1)

@@ -1,11 +1,11 @@
 """Scale measurements from image to metres: sources, signs and sigmas."""
 
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 import pytest
-from rendered import CAMERA, film, sideways, stairs_world
+import rendered
+from rendered import CAMERA, film, stairs_world
 
 from edgeslam_torch.config import DepthConfig, SlamConfig
 from edgeslam_torch.estimation.motion import MotionFusion
@@ -18,9 +18,8 @@ from edgeslam_torch.types import DepthMap, TelemetrySample, Units
 NO_NETWORK = SlamConfig(depth=DepthConfig(weights="none"))
 
 
-@lru_cache(maxsize=1)
 def panels():
-    return film(stairs_world(), CAMERA, sideways(30, 0.03, turn_rad=0.004), step_s=1 / 30)
+    return rendered.panels().first(30)
 
 
 def length(T_w_c):

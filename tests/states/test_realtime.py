@@ -2,12 +2,11 @@
 
 import threading
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 import pytest
 from point_map import check_map
-from rendered import CAMERA, film, sideways, stairs_world
+from rendered import CAMERA, film, panels, sideways, stairs_world
 from scheduler import Scheduler
 
 from edgeslam_torch.config import DepthConfig, SlamConfig
@@ -19,12 +18,6 @@ from edgeslam_torch.types import FrameStatus
 
 NO_NETWORK = SlamConfig(depth=DepthConfig(weights="none"))
 SUPPORTED = {FrameStatus.INITIALISED, FrameStatus.TRACKED}
-
-
-@lru_cache(maxsize=1)
-def panels():
-    """40 images past panels at many depths, 1.2 m sideways."""
-    return film(stairs_world(), CAMERA, sideways(40, 0.03, turn_rad=0.004), step_s=1 / 30)
 
 
 def realtime(scheduler, depth=None):
