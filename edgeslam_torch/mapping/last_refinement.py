@@ -27,9 +27,9 @@ EFFECTIVE_SAMPLES = 2.4
 """Errors of neighbouring pixels on an edge are correlated: about six count as one (the root of six)."""
 ITERATIONS = 30
 COST_TOLERANCE = 1e-5
-POSE_TOLERANCE = 0.5
-"""Distance to the minimum [standard deviations of independent errors, all poses together]: errors of keypoints are
-correlated, so that the true standard deviation is several times larger."""
+POSE_TOLERANCE = 0.1
+"""Distance to the minimum [standard deviations, all poses together]. At half a standard deviation the drift of scale in
+big steps, a direction of small curvature, is left in the map."""
 MU = 1e-8
 """Initial damping: scale drift, or rotation explained as translation, is a slow mode, which a solver damped by the
 stiff modes never corrects (docs/decisions/12-solver.md)."""
