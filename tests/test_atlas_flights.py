@@ -3,7 +3,6 @@
 from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from point_map import check_map
@@ -14,7 +13,6 @@ from edgeslam_torch.atlas.prior_map import FOUND
 from edgeslam_torch.cli import main
 from edgeslam_torch.config import DepthConfig, SlamConfig
 from edgeslam_torch.eval.metrics.align import umeyama
-from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.types import FrameStatus
 
@@ -119,14 +117,7 @@ def recording(tmp_path, write_tum) -> Path:
 @pytest.mark.slow
 def test_command_saves_and_reports(tmp_path, write_images, capsys):
     for name, shot in (("monday", panels()), ("tuesday", second_film())):
-        folder = tmp_path / name
-        (folder / "rgb").mkdir(parents=True)
-        rows = []
-        for frame in shot.frames:
-            cv2.imwrite(str(folder / f"rgb/{frame.index:03d}.png"), frame.image)
-            rows.append(f"{frame.stamp_s:.6f} rgb/{frame.index:03d}.png\n")
-        (folder / "rgb.txt").write_text("".join(rows))
-        save_camera(folder / "camera.yaml", CAMERA)
+        shot.write(tmp_path / name)
     atlas = str(tmp_path / "room.atlas")
     options = ["--depth", "none", "--no-report", "--out"]
     assert main(["run", str(tmp_path / "monday"), *options, str(tmp_path / "m"), "--save-atlas", atlas]) == 0

@@ -6,15 +6,13 @@ import shlex
 from pathlib import Path
 from types import ModuleType
 
-import cv2
 import numpy as np
 import pytest
-from rendered import CAMERA, film, sideways, stairs_world
+from rendered import panels
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.judge import release
 from edgeslam_torch.eval.judge.release import FIGURES, RUNS, release_record
-from edgeslam_torch.geometry.camera_file import save_camera
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
@@ -46,11 +44,7 @@ def test_readme_shows_commands_that_the_release_runs() -> None:
 
 
 def test_readme_s_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "tum_fr1_xyz"
-    folder.mkdir()
-    for frame in film(stairs_world(), CAMERA, sideways(6, 0.03)).frames:
-        cv2.imwrite(str(folder / f"{frame.index}.png"), frame.image)
-    save_camera(folder / "camera.yaml", CAMERA)
+    panels().first(6).write(tmp_path / "tum_fr1_xyz")
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
     names: dict[str, np.ndarray] = {}

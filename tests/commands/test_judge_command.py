@@ -2,36 +2,16 @@
 
 import json
 
-import cv2
-import numpy as np
 import pytest
-from rendered import CAMERA, film, sideways, stairs_world
+from rendered import panels
 
 from edgeslam_torch import cli
-from edgeslam_torch.commands.judging import judge
-from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
-from edgeslam_torch.eval.judge import cells
-from edgeslam_torch.geometry.camera_file import save_camera
-
-
-def test_every_set_of_cells_is_offered():
-    assert judge.CELLS == cells.SETS
 
 
 @pytest.fixture
 def data(tmp_path):
     """A folder with one recording of 30 images."""
-    folder = tmp_path / "data" / "stairs"
-    folder.mkdir(parents=True)
-    flight = film(stairs_world(), CAMERA, sideways(30, 0.03))
-    lines = []
-    for frame in flight.frames:
-        cv2.imwrite(str(folder / f"{frame.index}.png"), frame.image)
-        lines.append(f"{frame.stamp_s:.3f} {frame.index}.png")
-    (folder / "rgb.txt").write_text("\n".join(lines) + "\n")
-    save_camera(folder / "camera.yaml", CAMERA)
-    write_tum(Trajectory(flight.stamps_s, np.asarray(flight.T_w_c)), folder / "groundtruth.txt")
-    return folder.parent
+    return panels().first(30).write(tmp_path / "data" / "stairs").parent
 
 
 @pytest.mark.slow

@@ -211,13 +211,6 @@ def test_hostile_archive_leaves_nothing(one, tmp_path, capsys):
     assert not list(tmp_path.rglob("*.unpacking"))
 
 
-def test_archive_without_a_recording_is_refused(one, tmp_path, capsys):
-    one(tgz({"rgbd_dataset_freiburg1_xyz/readme": b"moved"}))
-    assert get(tmp_path, "tum_fr1_a") == 1
-    assert "has the publisher changed the archive?" in capsys.readouterr().err
-    assert not (tmp_path / "rec" / "tum_fr1_a").exists()
-
-
 def test_two_recordings_of_one_archive_are_one_download(shop, publisher, tmp_path):
     def scene(number):
         names = [f"frame-{i:06d}" for i in range(3)]

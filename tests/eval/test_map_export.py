@@ -73,15 +73,6 @@ def test_plyfile_reads_what_was_written(cloud: PointCloud, tmp_path: Path) -> No
     np.testing.assert_array_equal(found["observations"], cloud.observations)
 
 
-def test_pypcd_reads_what_was_written(cloud: PointCloud, tmp_path: Path) -> None:
-    pypcd4 = pytest.importorskip("pypcd4", reason="pypcd4 is not installed")
-    write_pcd(tmp_path / "m.pcd", cloud)
-    found = pypcd4.PointCloud.from_path(tmp_path / "m.pcd")
-    np.testing.assert_array_equal(found.numpy(("x", "y", "z")), cloud.p_w)
-    np.testing.assert_array_equal(pypcd4.PointCloud.decode_rgb(found.pc_data["rgb"]), cloud.colour)
-    np.testing.assert_array_equal(found.pc_data["sigma"], cloud.sigma_m)
-
-
 READ_COLMAP = """
 import json, sys, pycolmap
 r = pycolmap.Reconstruction(sys.argv[1])

@@ -25,22 +25,6 @@ def _check(parser: argparse.ArgumentParser, *words: object) -> None:
     check_outputs(parser, parser.parse_args([str(word) for word in words]))
 
 
-def test_a_new_file_needs_no_leave(parser, tmp_path: Path) -> None:
-    _check(parser, tmp_path, "x" * 5000, "a\0b", "webcam:0", "--json", tmp_path / "a", "-m", "-")
-
-
-@pytest.mark.parametrize("kind", ["file", "link", "dangling link"])
-def test_what_exists_is_replaced_with_overwrite_alone(parser, tmp_path: Path, kind: str) -> None:
-    path = tmp_path / "a"
-    if kind != "file":
-        path.symlink_to(tmp_path / "b")
-    if kind != "dangling link":
-        (tmp_path / ("b" if kind == "link" else "a")).touch()
-    with pytest.raises(OutputError, match="--overwrite"):
-        _check(parser, "in", "--json", path)
-    _check(parser, "in", "--json", path, "--overwrite")
-
-
 @pytest.mark.parametrize("spelling", ["same", "relative", "symlink", "hard link"])
 def test_what_is_read_is_never_replaced(parser, tmp_path: Path, monkeypatch, spelling: str) -> None:
     monkeypatch.chdir(tmp_path)

@@ -96,10 +96,6 @@ def test_network_input_has_the_images_shape_at_the_training_area(size: tuple[int
     assert abs(np.log((w / h) / (size[1] / size[0]))) < 0.12
 
 
-def test_training_shape_is_used_for_the_training_cameras() -> None:
-    assert network_size(480, 640, (192, 256)) == (192, 256)
-
-
 def test_wrong_size_backend_and_files_are_rejected(weights: Path, image: np.ndarray, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="does not fit"):
         DepthPredictor(weights)(image[:60], CAMERA)

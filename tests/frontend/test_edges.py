@@ -48,13 +48,6 @@ def test_colour_is_rgb_of_the_pixel():
     np.testing.assert_array_equal(edges.colour, image[v, u][:, ::-1])
 
 
-def test_black_image_has_none():
-    edges = extract_edges(np.zeros((60, 80, 3), np.uint8), 40.0, 100.0, 500)
-    assert edges.uv.shape == (0, 2)
-    assert edges.normal.shape == (0, 2)
-    assert edges.colour.shape == (0, 3)
-
-
 def in_the_dark(image, exposure, noise_grey):
     """The picture that a camera takes with so much less light: darker, as noisy as before, in whole grey levels."""
     noisy = exposure * image + noise_grey * np.random.default_rng(3).standard_normal(image.shape)

@@ -12,7 +12,7 @@ from small_networks import FAR_M, NEAR_M, RELATIVE, describe, green_network, nod
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.frontend import depth_network
 from edgeslam_torch.frontend.depth_check import CheckedDepth
-from edgeslam_torch.frontend.depth_network import DepthPredictor, open_depth, weights_path
+from edgeslam_torch.frontend.depth_network import open_depth, weights_path
 from edgeslam_torch.frontend.external_depth import ExternalDepth, relative_depth
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
@@ -206,11 +206,6 @@ def test_preset_runs_a_graph_of_its_networks_signature(tmp_path, monkeypatch, na
 def test_a_preset_can_be_corrected(tmp_path, image):
     path = describe(green_network(tmp_path / "n.onnx"), 'preset = "metric3d-v2-small"\ndepth = ""\nmultiple = 14\n')
     assert open_depth(path).network.multiple == 14
-
-
-def test_our_own_weights_are_opened_as_before():
-    assert weights_path("default") is None
-    assert isinstance(open_depth(), DepthPredictor) and open_depth().is_metric
 
 
 def test_weights_that_come_with_the_package_have_names(image):

@@ -22,13 +22,6 @@ def flipped(rng, bits, count):
     return words(np.packbits(raw, axis=1))
 
 
-def test_hamming_worked_by_hand():
-    a = np.zeros((2, 32), np.uint8)
-    b = a.copy()
-    b[0, 5], b[1, 31] = 0b1011, 0xFF
-    assert hamming(words(a), words(b)).tolist() == [3, 8]
-
-
 def test_hamming_is_opencvs(rng):
     a, b = rng.integers(0, 256, (2, 30, 32), dtype=np.uint8)
     expected = [int(cv2.norm(x, y, cv2.NORM_HAMMING)) for x, y in zip(a, b, strict=True)]

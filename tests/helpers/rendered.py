@@ -3,10 +3,13 @@
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import cv2
 import numpy as np
 
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.house.rooms import random_pose, room
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
@@ -44,6 +47,27 @@ class RenderedFlight:
         """The flight up to its ``count``-th image."""
         frames, depth_m, T_w_c = self.frames[:count], self.depth_m[:count], self.T_w_c[:count]
         return replace(self, frames=frames, depth_m=depth_m, T_w_c=T_w_c)
+
+    def write(self, folder, depth_every=0):
+        """A recording in TUM's layout with camera and ground truth; every so many images a depth map [mm]."""
+        for name in ("rgb", "depth"):
+            (folder / name).mkdir(parents=True)
+        lists = {"rgb": "", "depth": ""}
+        for frame, z in zip(self.frames, self.depth_m, strict=True):
+            images = {"rgb": frame.image}
+            if depth_every and frame.index % depth_every == 0:
+                images["depth"] = (1000 * z).astype(np.uint16)
+            for kind, image in images.items():
+                cv2.imwrite(str(folder / kind / f"{frame.stamp_s:.3f}.png"), image)
+                lists[kind] += f"{frame.stamp_s:.3f} {kind}/{frame.stamp_s:.3f}.png\n"
+        (folder / "rgb.txt").write_text(lists["rgb"])
+        if depth_every:
+            (folder / "depth.txt").write_text(lists["depth"])
+        save_camera(folder / "camera.yaml", self.camera)
+        with (folder / "camera.yaml").open("a") as file:
+            file.write("depth_scale: 1000.0\n")
+        write_tum(Trajectory(self.stamps_s, self.T_w_c), folder / "groundtruth.txt")
+        return folder
 
     def with_images(self, change):
         """Frames whose images are what ``change(index, image)`` makes of them."""

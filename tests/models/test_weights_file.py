@@ -224,14 +224,6 @@ def test_what_is_no_record_is_refused(file: File, tmp_path: Path, text: str, mat
         read_header(path)
 
 
-@pytest.mark.parametrize("field", ["focal_px", "mean", "input_width", "output"])
-def test_a_record_that_does_not_say_how_to_run_it_is_refused(field: str) -> None:
-    record = asdict(METADATA)
-    del record[field]
-    with pytest.raises(WeightsError, match=f"has no value for {field}"):
-        metadata_from_json(json.dumps(record))
-
-
 def test_fields_of_newer_files_are_ignored() -> None:
     assert metadata_from_json(json.dumps(asdict(METADATA) | {"lens": "fisheye"})) == METADATA
 

@@ -98,13 +98,6 @@ def test_the_number_of_tracked_keypoints_is_limited_and_they_are_spread(scene):
     assert len({(int(u // 80), int(v // 80)) for u, v in uv}) >= 11  # cells of a 4 x 3 grid
 
 
-def test_removed_anchors_are_not_tracked(scene):
-    gone = scene.keyframe.anchor[::2].copy()
-    scene.map.remove_anchors(gone)
-    track = scene.tracker(points=1000).follow(scene.template, scene.grey, scene.keyframe.T_c_w).track
-    assert not np.isin(track.matched_anchor, gone).any()
-
-
 def test_keypoints_out_of_view_count_against_the_share(scene):
     """Turned until a part has left the image: what is left tells the pose, and the share that it is less."""
     turned = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, 0.3, 0]))
@@ -287,12 +280,6 @@ def test_few_matches_is_decided_by_stable_anchors(scene):
         other = make_keyframe(id, id, float(id), se3.inverse(POSES[id]), scene.keyframe.features)
         scene.map.add_keyframe(other)
     assert not few_matches(track, scene.keyframe, scene.map, MappingConfig())
-
-
-@pytest.mark.parametrize("settings", [{"points": 0}, {"window_px": 3}, {"levels": 0}, {"min_share": 0.0}])
-def test_settings_out_of_range_are_rejected(settings):
-    with pytest.raises(ValueError, match=next(iter(settings))):
-        FlowConfig(**settings)
 
 
 def test_keypoints_are_selected_again_when_the_map_changes(scene):

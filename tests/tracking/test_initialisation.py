@@ -490,14 +490,3 @@ def test_points_behind_the_second_camera_do_not_triangulate(rng):
     assert found.ok
     assert len(found.keypoint) > 90
     assert found.keypoint.max() < len(ahead)
-
-
-def test_of_two_intermediate_frames_at_one_place_the_first_is_kept(points):
-    """One step, another, and no step: the frame between two of one place is the one that tells least."""
-    bootstrap = make_bootstrap(points, z_in(points, 0), InitialisationConfig(keyframe_gap_s=0.01, max_keyframes=2))
-    for index, view in enumerate((1, 2, 2), start=1):
-        seen = view_of(points, view)
-        track = bootstrap.track(seen, points.world.T_c_w[view])
-        bootstrap.two_views(index, seen, track)
-        bootstrap.wait(Frame(index, 0.1 * index, np.zeros((4, 4), np.uint8)), seen, track)
-    assert [w.frame.index for w in bootstrap.waiting] == [1, 3]

@@ -5,7 +5,6 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from rendered import CAMERA, film, sideways, stairs_world
@@ -18,7 +17,6 @@ from edgeslam_torch.eval.judge import flights, run_cell
 from edgeslam_torch.eval.judge.cells import VARIANTS, Cell, list_cells
 from edgeslam_torch.eval.judge.score import Truth, score
 from edgeslam_torch.eval.judge.simulated_imu import RECORDED
-from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.synthetic.flights.courses import COURSES, record_course
 
 
@@ -39,25 +37,7 @@ def recording(tmp_path_factory):
 
     The way is bent: how a map is turned about a straight one rests on millimetres beside it.
     """
-    folder = tmp_path_factory.mktemp("data") / "stairs"
-    flight = film(stairs_world(), CAMERA, bent_way())
-    (folder / "rgb").mkdir(parents=True)
-    (folder / "depth").mkdir()
-    lines, depth = [], []
-    for frame, z in zip(flight.frames, flight.depth_m, strict=True):
-        name = f"rgb/{frame.stamp_s:.3f}.png"
-        cv2.imwrite(str(folder / name), frame.image)
-        lines.append(f"{frame.stamp_s:.3f} {name}")
-        if frame.index % 6 == 0:
-            cv2.imwrite(str(folder / name.replace("rgb", "depth")), (1000 * z).astype(np.uint16))
-            depth.append(f"{frame.stamp_s:.3f} {name.replace('rgb', 'depth')}")
-    (folder / "rgb.txt").write_text("\n".join(lines) + "\n")
-    (folder / "depth.txt").write_text("\n".join(depth) + "\n")
-    save_camera(folder / "camera.yaml", CAMERA)
-    with (folder / "camera.yaml").open("a") as file:
-        file.write("depth_scale: 1000.0\n")
-    write_tum(Trajectory(flight.stamps_s, flight.T_w_c), folder / "groundtruth.txt")
-    return folder
+    return film(stairs_world(), CAMERA, bent_way()).write(tmp_path_factory.mktemp("data") / "stairs", depth_every=6)
 
 
 def run(tmp_path, cell, **changes):

@@ -75,14 +75,6 @@ def test_a_bag_written_byte_by_byte_after_the_format(tmp_path):
     np.testing.assert_array_equal(frames[2].image, _pixels(2)[:, :, ::-1])  # written as RGB
 
 
-def test_a_camera_given_by_the_user_replaces_the_bags(tmp_path):
-    info = ("/cam/camera_info", INFO, BEGIN_S, bags.camera_info((64, 48), 60.0, (0.3, 0.1, 0, 0), "equidistant"))
-    path = bags.write_mcap(tmp_path / "a.mcap", [info, *_pictures(_times(2))])
-    mine = tmp_path / "mine.yaml"
-    mine.write_text("width: 64\nheight: 48\nfx: 70\nfy: 70\ncx: 31\ncy: 23\n")
-    assert open_source(path, camera=mine).camera.fx == 70.0
-
-
 def test_missing_and_empty_camera_info_are_said(tmp_path):
     without = open_source(bags.write_mcap(tmp_path / "a.mcap", _pictures(_times(2))))
     assert "no calibration found" in without.warnings[0]
