@@ -19,7 +19,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--command-port", type=int, default=8889, metavar="PORT", help="default: 8889")
     parser.add_argument("--state-port", type=int, default=8890, metavar="PORT", help="client's port, default: 8890")
     parser.add_argument("--video-port", type=int, default=11111, metavar="PORT", help="client's port, default: 11111")
-    parser.add_argument("--world", metavar="NAME", help="a named world such as l_corridor (default: a furnished room)")
+    parser.add_argument(
+        "--world",
+        metavar="NAME|FILE",
+        help="a world such as l_corridor, or a scene file *.toml (default: a furnished room)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the world (default: 0)")
     parser.add_argument("--wind", type=float, default=0.0, metavar="M_S", help="mean wind across, half of it as gusts")
     parser.add_argument("--battery", type=float, default=100.0, metavar="PERCENT", help="charge at the start")
@@ -114,13 +118,9 @@ def _address(args: argparse.Namespace, command_port: int) -> str:
 
 
 def _site(name: str, seed: int) -> "Site":
-    from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.synthetic.sites.build import named_site
 
-    try:
-        return named_site(name, seed)
-    except ValueError as error:
-        raise ConfigError(f"--world: {error}") from error
+    return named_site(name, seed)
 
 
 def _measure(args: argparse.Namespace) -> int:

@@ -71,9 +71,9 @@ def nothing_to_see(kind: str, seed: int) -> Recording:
 
 @lru_cache(maxsize=1)
 def _simulator() -> str:
-    """Digest of the simulator's code."""
+    """Digest of the simulator's code and scenes."""
     digest = hashlib.sha256()
-    for path in sorted(Path(synthetic.__file__).parent.rglob("*.py")):
+    for path in sorted(p for p in Path(synthetic.__file__).parent.rglob("*.*") if p.suffix in (".py", ".toml")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:8]
 

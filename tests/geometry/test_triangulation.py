@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from point_world import box_room
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.triangulation import bearings, parallax, triangulate
-from edgeslam_torch.synthetic import box_room
 
 
 def test_point_worked_by_hand():

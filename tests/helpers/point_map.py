@@ -1,13 +1,13 @@
 """A map whose features are exact projections of known points with descriptors of their own."""
 
 import numpy as np
+from point_world import box_room
 
 from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.synthetic import box_room
 from edgeslam_torch.types import FrameFeatures
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 319.5, 239.5)

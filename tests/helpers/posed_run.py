@@ -10,8 +10,9 @@ import numpy as np
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.synthetic.house.render import render
-from edgeslam_torch.synthetic.house.rooms import look, room
+from edgeslam_torch.synthetic.house.views import look
 from edgeslam_torch.synthetic.house.world import World
+from edgeslam_torch.synthetic.sites.build import place
 from edgeslam_torch.types import PointCloud
 from edgeslam_torch.writers.ply import write_ply
 from edgeslam_torch.writers.run_writer import tum_line
@@ -23,7 +24,7 @@ FRAMES = 12
 @cache
 def world() -> World:
     """Drawn once: it is the slowest thing here."""
-    return room(np.random.default_rng(5))
+    return place("furnished_room", np.random.default_rng(5))
 
 
 def write_run(root: Path) -> Path:

@@ -11,8 +11,9 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.synthetic.house.render import render
-from edgeslam_torch.synthetic.house.rooms import random_pose, room
+from edgeslam_torch.synthetic.house.views import random_pose
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
+from edgeslam_torch.synthetic.sites.build import place
 from edgeslam_torch.types import DepthMap, Frame
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5, source="test")
@@ -84,7 +85,7 @@ def panels():
 def room_view():
     """A furnished room, ``(240, 320, 3)``."""
     rng = np.random.default_rng(3)
-    world = room(rng)
+    world = place("furnished_room", rng)
     return render(world, CAMERA, random_pose(rng, world)).image
 
 

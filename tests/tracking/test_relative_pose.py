@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from point_map import CAMERA
+from point_world import box_room
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.synthetic import box_room
 from edgeslam_torch.tracking.relative_pose import relative_pose
 from edgeslam_torch.types import MotionKind
 

@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from point_world import box_room
 from rendered import film, stairs_world
 
 from edgeslam_torch.geometry import se3
@@ -12,7 +13,6 @@ from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, Camera
 from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig
-from edgeslam_torch.synthetic import box_room
 from edgeslam_torch.tracking.self_calibration import (
     FocalEstimate,
     _map_problem,

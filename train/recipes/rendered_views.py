@@ -14,17 +14,9 @@ import numpy as np
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.render import Rendered, render
-from edgeslam_torch.synthetic.house.rooms import (
-    blank_corridor,
-    building,
-    corridor,
-    look,
-    random_room,
-    random_view,
-    room,
-)
+from edgeslam_torch.synthetic.house.views import look, random_room, random_view
 from edgeslam_torch.synthetic.house.world import World
-from edgeslam_torch.synthetic.sites.build import JUDGED, named_site
+from edgeslam_torch.synthetic.sites.build import JUDGED, named_site, place
 from edgeslam_torch.terminal.progress import counted
 from edgeslam_torch.train.views.rendered import is_worth_learning
 from edgeslam_torch.types import FloatArray
@@ -54,14 +46,18 @@ def random_place(rng: Rng) -> World:
     if kind < 0.3:
         return random_room(rng)
     if kind < 0.5:
-        return corridor(rng, length_m=_log(rng, 6, 24), width_m=_log(rng, 1.5, 4.0), height_m=_log(rng, 2.3, 3.6))
+        return place("long_corridor", rng, **_size(rng, (6, 24), (1.5, 4.0), (2.3, 3.6)))
     if kind < 0.68:
-        return blank_corridor(rng, length_m=_log(rng, 6, 24), width_m=_log(rng, 1.5, 4.0), height_m=_log(rng, 2.3, 3.6))
+        return place("long_blank_corridor", rng, **_size(rng, (6, 24), (1.5, 4.0), (2.3, 3.6)))
     if kind < 0.8:  # as wide as a hall
-        return blank_corridor(rng, length_m=_log(rng, 8, 24), width_m=_log(rng, 4.0, 11.0), height_m=_log(rng, 2.6, 6))
+        return place("long_blank_corridor", rng, **_size(rng, (8, 24), (4.0, 11.0), (2.6, 6)))
     if kind < 0.95:
-        return room(rng, size_m=(_log(rng, 6, 16), _log(rng, 5, 11), _log(rng, 2.4, 5)))
-    return building(rng, side_m=_log(rng, 3.2, 5.0), opening_m=rng.uniform(0.9, 1.8))
+        return place("furnished_room", rng, **_size(rng, (6, 16), (5, 11), (2.4, 5)))
+    return place("building", rng, side=_log(rng, 3.2, 5.0), opening=float(rng.uniform(0.9, 1.8)))
+
+
+def _size(rng: Rng, *ranges: tuple[float, float]) -> dict[str, float]:
+    return {name: _log(rng, *ends) for name, ends in zip(("long", "wide", "high"), ranges, strict=True)}
 
 
 def oblique_pose(rng: Rng, world: World) -> FloatArray | None:

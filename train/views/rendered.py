@@ -6,8 +6,7 @@ import numpy as np
 
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.synthetic.house.rooms import random_room
-from edgeslam_torch.synthetic.house.rooms import random_view as view_of_room
+from edgeslam_torch.synthetic.house.views import random_room, random_view
 from edgeslam_torch.terminal.progress import counted
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.types import FloatArray
@@ -31,7 +30,7 @@ def render_rooms(path: Path, rooms: int, views_per_room: int = 6, seed: int = 7)
         for _ in range(views_per_room):
             focal = float(np.exp(rng.uniform(*np.log(FOCAL_PX))))
             camera = Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
-            rendered = view_of_room(rng, camera, world)
+            rendered = random_view(rng, camera, world)
             images.append(rendered.image)
             depths.append(rendered.depth_m.astype(np.float16))
             matrices.append(camera.K)

@@ -49,7 +49,8 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
         "--drone",
         default="tello://",
         metavar="ADDRESS",
-        help="tello://HOST[:PORTS], or sim://WORLD[:SEED] for an emulated one without network (default: tello://)",
+        help="tello://HOST[:PORTS], or sim://WORLD[:SEED] for an emulated one without network; WORLD is a name or a "
+        "scene file *.toml (default: tello://)",
     )
     parser.add_argument("--fly", action="store_true", help="fly; without it nothing moves and the plan is shown")
     parser.add_argument("--dry-run", action="store_true", help="show the plan without contacting the drone")

@@ -9,8 +9,8 @@ from edgeslam_torch.drone.emulator.drone import DroneModel
 from edgeslam_torch.geometry.camera import PRESETS, Camera
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.house.render import picture
-from edgeslam_torch.synthetic.house.rooms import room
 from edgeslam_torch.synthetic.house.world import MAX_LEVEL
+from edgeslam_torch.synthetic.sites.build import place
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.synthetic.sites.solids import Solids
 from edgeslam_torch.types import FloatArray
@@ -30,7 +30,7 @@ def furnished_drone(
         battery: Charge in [0, 1].
     """
     rng = np.random.default_rng(seed)
-    world = room(rng)
+    world = place("furnished_room", rng)
     low, high = world.bounds_w
     places = rng.uniform(low, high, (500, 3))
     places[:, 2] = low[2] + 0.9

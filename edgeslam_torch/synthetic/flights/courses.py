@@ -15,8 +15,8 @@ from edgeslam_torch.synthetic.flights.flight import Flight, FlightPlan, climb, f
 from edgeslam_torch.synthetic.flights.imu import mounted, simulate_imu
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 from edgeslam_torch.synthetic.flights.writer import write_flight
-from edgeslam_torch.synthetic.house.rooms import BLOCK_M, BUILDING_M, blank_corridor, block, building, corridor, room
 from edgeslam_torch.synthetic.house.world import World
+from edgeslam_torch.synthetic.sites.build import place
 
 Rng = np.random.Generator
 SECONDS, RATE_HZ = 16.0, 20.0
@@ -36,7 +36,8 @@ class Pilot(Protocol):
 class Course:
     """One kind of flight; the seed decides place, furniture, path and noise."""
 
-    world: Callable[[Rng], World] = room
+    scene: str = "furnished_room"
+    """A name in `synthetic/scenes`."""
     pilot: Pilot = fly
     faults: CameraFaults = field(default_factory=CameraFaults)
     telemetry: TelemetryFaults | None = field(default_factory=TelemetryFaults)
@@ -44,7 +45,13 @@ class Course:
     seconds: float = SECONDS
     rate_hz: float = RATE_HZ
 
+    def world(self, rng: Rng) -> World:
+        """Its place."""
+        return place(self.scene, rng)
 
+
+BLOCK_M, BUILDING_M = (11.0, 9.0), (16.0, 4.0)
+"""Sides of the line through the scenes ``block`` and ``building``: once around is 40 m."""
 AROUND_BLOCK = partial(fly_around, sides_m=BLOCK_M, plan=FlightPlan(speed_m_s=0.8))
 AROUND_BUILDING = partial(fly_around, sides_m=BUILDING_M, plan=FlightPlan(speed_m_s=0.8))
 WIND = FlightPlan(wind_m_s2=0.5, gust_m_s2=0.3)
@@ -55,17 +62,17 @@ LOW_LIGHT = CameraFaults(gain=0.2, read_noise=2.5, shot_noise=0.35, vignetting=0
 COURSES = {
     "room": Course(),
     "room_no_telemetry": Course(telemetry=None),
-    "corridor": Course(corridor),
-    "corridor_no_telemetry": Course(corridor, telemetry=None),
-    "blank_corridor": Course(blank_corridor),
-    "block": Course(block, AROUND_BLOCK, seconds=64.0, rate_hz=15.0),
-    "block_no_telemetry": Course(block, AROUND_BLOCK, telemetry=None, seconds=64.0, rate_hz=15.0),
-    "building": Course(building, AROUND_BUILDING, seconds=64.0, rate_hz=15.0),
+    "corridor": Course("long_corridor"),
+    "corridor_no_telemetry": Course("long_corridor", telemetry=None),
+    "blank_corridor": Course("long_blank_corridor"),
+    "block": Course("block", AROUND_BLOCK, seconds=64.0, rate_hz=15.0),
+    "block_no_telemetry": Course("block", AROUND_BLOCK, telemetry=None, seconds=64.0, rate_hz=15.0),
+    "building": Course("building", AROUND_BUILDING, seconds=64.0, rate_hz=15.0),
     "climb": Course(pilot=climb),
     "yaw": Course(pilot=turn),
     "windy_room": Course(pilot=partial(fly, plan=WIND)),
-    "windy_corridor": Course(corridor, partial(fly, plan=WIND)),
-    "windy_blank_corridor": Course(blank_corridor, partial(fly, plan=WIND)),
+    "windy_corridor": Course("long_corridor", partial(fly, plan=WIND)),
+    "windy_blank_corridor": Course("long_blank_corridor", partial(fly, plan=WIND)),
     "windy_climb": Course(pilot=partial(climb, plan=WIND)),
     "windy_hover_first": Course(pilot=partial(fly_after_hover, plan=WIND)),
     "low_light": Course(faults=LOW_LIGHT),

@@ -1,5 +1,6 @@
-"""A world of textured parallelograms, and its exact edges and corners."""
+"""A world of textured parallelograms and solid boxes."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,8 @@ from edgeslam_torch.types import FloatArray
 
 MAX_LEVEL = 18
 """Half-octave texture levels: the coarsest is 1/512 of the finest."""
+_CHUNK = 512
+"""Points at a time."""
 
 
 class Texture:
@@ -75,39 +78,55 @@ class Box:
     """``(3,)`` half extents along its own axes [m]."""
     yaw_rad: float = 0.0
 
-    def to_local(self, p_w: FloatArray) -> FloatArray:
-        """Points ``(..., 3)`` in the box's own axes, centre at zero."""
-        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
-        R_w_box = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return (np.asarray(p_w) - self.centre_w) @ R_w_box
-
     def distance(self, p_w: FloatArray) -> FloatArray:
         """Distance [m] of points ``(..., 3)`` outside; 0 inside."""
-        return np.linalg.norm(np.maximum(np.abs(self.to_local(p_w)) - self.half_m, 0.0), axis=-1)
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        local = (np.asarray(p_w) - self.centre_w) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return np.linalg.norm(np.maximum(np.abs(local) - self.half_m, 0.0), axis=-1)
 
 
-@dataclass(frozen=True, slots=True)
-class EdgeSegments:
-    """Straight 3-D edges known from geometry."""
+class Boxes:
+    """Boxes, arranged for questions about many points at once."""
 
-    p_w: FloatArray
-    """``(S, 2, 3)`` ends [m]."""
-    quad: np.ndarray
-    """``(S,)`` the quad each belongs to, int32."""
+    def __init__(self, boxes: Sequence[Box]) -> None:
+        self._centre = np.array([b.centre_w for b in boxes]).reshape(-1, 3)
+        self._half = np.array([b.half_m for b in boxes]).reshape(-1, 3)
+        yaw = np.array([b.yaw_rad for b in boxes])
+        self._cos, self._sin = np.cos(yaw), np.sin(yaw)
+
+    def distance(self, p_w: FloatArray) -> FloatArray:
+        """Distance [m] of points ``(..., 3)`` to the nearest box; 0 inside, infinite without boxes."""
+        offset = p_w[..., None, :] - self._centre  # (..., B, 3)
+        x = self._cos * offset[..., 0] + self._sin * offset[..., 1]
+        y = self._cos * offset[..., 1] - self._sin * offset[..., 0]
+        out = [np.maximum(np.abs(v) - self._half[:, k], 0.0) for k, v in enumerate((x, y, offset[..., 2]))]
+        return np.sqrt((out[0] ** 2 + out[1] ** 2 + out[2] ** 2).min(-1, initial=np.inf))
 
 
-@dataclass(frozen=True, slots=True)
-class Junctions:
-    """Corners where two straight edges of a quad meet (L-junctions)."""
+class Surfaces:
+    """Quads, arranged for questions about many points at once."""
 
-    p_w: FloatArray
-    """``(C, 3)`` corner [m]."""
-    arm_a_w: FloatArray
-    """``(C, 3)`` far end of one arm [m]."""
-    arm_b_w: FloatArray
-    """``(C, 3)`` far end of the other arm [m]."""
-    quad: np.ndarray
-    """``(C,)`` int32."""
+    def __init__(self, quads: Sequence[Quad]) -> None:
+        self._origin = np.array([q.origin_w for q in quads])
+        self._basis = np.stack([np.array([q.u_w for q in quads]), np.array([q.v_w for q in quads])], axis=2)
+        self._inverse = np.linalg.pinv(self._basis)
+
+    def distance(self, p_w: FloatArray) -> FloatArray:
+        """Distance [m] of points ``(N, 3)`` to the nearest quad.
+
+        Exact for rectangles; for slanted parallelograms (leaves) at most a few percent too far.
+        """
+        offset = p_w[:, None] - self._origin  # (N, Q, 3)
+        s, t = (np.clip((offset * self._inverse[:, k]).sum(-1), 0.0, 1.0) for k in (0, 1))
+        away = offset - s[..., None] * self._basis[..., 0] - t[..., None] * self._basis[..., 1]
+        return np.sqrt((away**2).sum(-1).min(1))
+
+
+def in_parts(distance: Callable[[FloatArray], FloatArray], p_w: FloatArray) -> FloatArray:
+    """``distance`` of points ``(N, 3)``, some hundred at a time: a few megabytes."""
+    points = np.asarray(p_w, dtype=np.float64)
+    parts = [distance(points[k : k + _CHUNK]) for k in range(0, len(points), _CHUNK)]
+    return np.concatenate(parts) if parts else np.zeros(0)
 
 
 class World:
@@ -132,10 +151,7 @@ class World:
         self.normals_w = np.stack([q.normal_w for q in quads])
         self.texels = np.array([q.texture.image.shape[0] * q.texture.image.shape[1] for q in quads], dtype=np.float64)
         self.two_sided = np.array([q.two_sided for q in quads])
-        self._box_centre = np.array([b.centre_w for b in self.boxes]).reshape(-1, 3)
-        self._box_half = np.array([b.half_m for b in self.boxes]).reshape(-1, 3)
-        yaw = np.array([b.yaw_rad for b in self.boxes])
-        self._box_cos, self._box_sin = np.cos(yaw), np.sin(yaw)
+        self._solid = Boxes(self.boxes)
         low, high = self.corners_w.min((0, 1)), self.corners_w.max((0, 1))
         self.bounds_w = np.stack([low, high]) if bounds_w is None else np.asarray(bounds_w, dtype=np.float64)
 
@@ -143,13 +159,7 @@ class World:
         """Distance [m] of points ``(..., 3)`` to the nearest wall or solid; negative outside the bounds."""
         p = np.asarray(p_w, dtype=np.float64)
         free = np.minimum(p - self.bounds_w[0], self.bounds_w[1] - p).min(-1)
-        if not self.boxes:
-            return free
-        offset = p[..., None, :] - self._box_centre  # (..., B, 3)
-        x = self._box_cos * offset[..., 0] + self._box_sin * offset[..., 1]
-        y = self._box_cos * offset[..., 1] - self._box_sin * offset[..., 0]
-        out = [np.maximum(np.abs(v) - self._box_half[:, k], 0.0) for k, v in enumerate((x, y, offset[..., 2]))]
-        return np.minimum(free, np.sqrt((out[0] ** 2 + out[1] ** 2 + out[2] ** 2).min(-1)))
+        return np.minimum(free, self._solid.distance(p))
 
     def floor_below(self, p_w: FloatArray) -> FloatArray:
         """Height [m] of the highest level surface under each point ``(N, 3)``; the lower bound where there is none."""
@@ -166,21 +176,4 @@ class World:
 
     def distance_to_surface(self, p_w: FloatArray) -> FloatArray:
         """Distance [m] of points ``(N, 3)`` to the nearest quad, ``(N,)``."""
-        p = np.asarray(p_w, dtype=np.float64)
-        best = np.full(len(p), np.inf)
-        for quad in self.quads:
-            basis = np.stack([quad.u_w, quad.v_w], axis=1)  # (3, 2)
-            st = np.clip((p - quad.origin_w) @ np.linalg.pinv(basis).T, 0.0, 1.0)
-            best = np.minimum(best, np.linalg.norm(p - quad.origin_w - st @ basis.T, axis=1))
-        return best
-
-    def edge_segments(self) -> EdgeSegments:
-        """The four borders of every quad."""
-        ends = np.stack([self.corners_w, np.roll(self.corners_w, -1, axis=1)], axis=2)  # (Q, 4, 2, 3)
-        return EdgeSegments(ends.reshape(-1, 2, 3), np.repeat(np.arange(len(self.quads), dtype=np.int32), 4))
-
-    def junctions(self) -> Junctions:
-        """The four corners of every quad with both borders that meet there."""
-        previous, following = np.roll(self.corners_w, 1, axis=1), np.roll(self.corners_w, -1, axis=1)
-        quad = np.repeat(np.arange(len(self.quads), dtype=np.int32), 4)
-        return Junctions(self.corners_w.reshape(-1, 3), previous.reshape(-1, 3), following.reshape(-1, 3), quad)
+        return in_parts(Surfaces(self.quads).distance, p_w)

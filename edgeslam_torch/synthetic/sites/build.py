@@ -1,273 +1,288 @@
-"""The named sites: seeded layouts with a start, a goal and exits."""
+"""Worlds of scene files: the one builder of rooms, corridors and buildings."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import combinations, pairwise
 
 import numpy as np
 
+from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.synthetic.house.rooms import FLOORS, TEXTURED_WALLS, furnish_wall, hang_lamp, line_wall, shell
+from edgeslam_torch.synthetic.house import dressing
 from edgeslam_torch.synthetic.house.scene import Place, Scene, random_paint
-from edgeslam_torch.synthetic.house.world import Box
+from edgeslam_torch.synthetic.house.walls import Opening, block, shell, side_of, wall
+from edgeslam_torch.synthetic.house.world import Box, World
 from edgeslam_torch.synthetic.sites.mirror import mirrored
 from edgeslam_torch.synthetic.sites.obstacles import connected, stand_in_the_way
 from edgeslam_torch.synthetic.sites.people import Walker, walker
+from edgeslam_torch.synthetic.sites.scene_file import Dress, SceneFile, Values, read_scene, scene_path
 from edgeslam_torch.synthetic.sites.site import Site, TrueExit
 from edgeslam_torch.synthetic.sites.solids import Solids
-from edgeslam_torch.synthetic.sites.walls import DOOR_HEIGHT_M, Opening, wall
+from edgeslam_torch.types import FloatArray
 
 Rng = np.random.Generator
-HEIGHT_M = 2.6
 GOAL_HEIGHT_M = 1.1
+JUDGED = ("cluttered_room", "corridor", "l_corridor", "two_rooms", "blank_walls")
+SITES = (*JUDGED, "t_corridor", "doors", "glass", "mirror", "people")
+"""Scenes with a start and a goal. The first five are static and judged; glass, mirror and people are flown, and nothing
+is promised."""
+_EPS_M = 1e-6
+_TRIES = 100
+"""Furniture at random may stand in a doorway: another draw has it elsewhere."""
+_OPEN_RAD = (1.6, 1.8)
+"""How far an open door leaf is turned."""
+
+
+@dataclass(slots=True)
+class _Wall:
+    """A wall at ``at`` on ``axis``, along the other axis from ``low`` to ``high``."""
+
+    axis: int
+    at: float
+    low: float
+    high: float
+    openings: list[Opening] = field(default_factory=list)
 
 
 @dataclass(slots=True)
 class _Layout:
-    """A site being built, in its own axes."""
+    """A scene being built, in its own axes."""
 
     scene: Scene
-    start: tuple[float, float, float]
-    """x, y [m] and heading [rad]."""
-    path: list[tuple[float, float]]
-    """From the start to the goal."""
+    start: list[float]
+    """x, y and heading [degrees]."""
+    way: list[list[float]] = field(default_factory=list)
     exits: list[TrueExit] = field(default_factory=list)
     panes: list[Box] = field(default_factory=list)
     """Glass: solid and not painted."""
     walkers: list[Walker] = field(default_factory=list)
-    mirror: bool = False
-    """Whether the wall at the high end of x is a mirror."""
-
-
-def _scene(
-    rng: Rng, low: Sequence[float], high: Sequence[float], walls: tuple[str, ...], lamps: Sequence[Sequence[float]]
-) -> Scene:
-    """Floor, ceiling, outer walls and ceiling lamps."""
-    bounds = np.array([*low, 0.0]), np.array([*high, HEIGHT_M])
-    scene = shell(rng, *bounds, 0.006, walls=walls, floors=FLOORS)
-    scene.ambient = 0.6
-    for x, y in lamps:
-        scene.lamps_w.append(np.array([x, y, HEIGHT_M - 0.1]))
-        hang_lamp(scene, scene.lamps_w[-1], 1.0, 0.3)
-    return scene
-
-
-def _exit(x: float, y: float, normal: tuple[float, float], width_m: float) -> TrueExit:
-    return TrueExit(np.array([x, y, DOOR_HEIGHT_M / 2]), np.array([*normal, 0.0]), width_m, DOOR_HEIGHT_M)
-
-
-def _cluttered_room(rng: Rng) -> _Layout:
-    """A furnished room with things of every height in the middle, and a doorway to the landing behind it."""
-    long, wide, landing = float(rng.uniform(6.0, 7.0)), float(rng.uniform(4.8, 5.6)), 1.8
-    scene = _scene(
-        rng, (0.0, 0.0), (long + landing, wide), TEXTURED_WALLS, [(0.3 * long, 0.5 * wide), (0.75 * long, 0.5 * wide),
-        (long + 0.9, 0.5 * wide)])  # fmt: skip
-    door = Opening(float(rng.uniform(0.3, 0.7)) * wide, float(rng.uniform(0.85, 1.1)))
-    wall(scene, rng, np.array([[long, 0.0], [long, wide]]), [door], TEXTURED_WALLS)
-    for place, length in (
-        (Place(long / 2, 0.0, 0.0), long),
-        (Place(long / 2, wide, np.pi), long),
-        (Place(0.0, wide / 2, -np.pi / 2), wide),
-    ):
-        furnish_wall(scene, place.at(0.0, 0.0), length - 1.4, rng, HEIGHT_M, density=0.7, door=False, pictures=0.8)
-    start = (0.9, 0.5 * wide, 0.0)
-    way = [(0.9, 0.5 * wide), (long - 0.9, door.at_m), (long + 0.5 * landing, door.at_m)]
-    stand_in_the_way(scene, rng, (1.8, 0.9), (long - 1.0, wide - 0.9), 5, [start[:2], way[1]])
-    return _Layout(scene, start, way, [_exit(long, door.at_m, (1.0, 0.0), door.width_m)])
-
-
-def _corridor(rng: Rng) -> _Layout:
-    """A corridor of 12 m with things left standing, and a doorway at its end."""
-    return _straight(rng, TEXTURED_WALLS, dressed=True)
-
-
-def _blank_walls(rng: Rng) -> _Layout:
-    """The same with painted walls and nothing on them."""
-    return _straight(rng, ("plaster",), dressed=False)
-
-
-def _straight(rng: Rng, walls: tuple[str, ...], *, dressed: bool) -> _Layout:
-    long, wide, lobby = 12.0, float(rng.uniform(2.0, 2.5)), 2.2
-    lamps = [(x, 0.0) for x in np.arange(1.2, long + lobby, 2.6)]
-    scene = _scene(rng, (0.0, -wide / 2), (long + lobby, wide / 2), walls, lamps)
-    door = Opening(wide / 2 + float(rng.uniform(-0.2, 0.2)), float(rng.uniform(0.85, 1.1)))
-    wall(scene, rng, np.array([[long, -wide / 2], [long, wide / 2]]), [door], walls)
-    if dressed:
-        line_wall(scene, Place(0.5 * long, -wide / 2, 0.0), long - 0.6, rng, HEIGHT_M)
-        line_wall(scene, Place(0.5 * long, wide / 2, np.pi), long - 0.6, rng, HEIGHT_M)
-    y = door.at_m - wide / 2
-    way = [(0.8, 0.0), (long - 0.8, y), (long + 0.5 * lobby, y)]
-    return _Layout(scene, (0.8, 0.0, 0.0), way, [_exit(long, y, (1.0, 0.0), door.width_m)])
-
-
-def _l_corridor(rng: Rng) -> _Layout:
-    """A corridor that turns left; straight on it ends after two metres."""
-    wide, first, second, stub = float(rng.uniform(1.9, 2.3)), float(rng.uniform(6.0, 7.5)), 5.5, 2.2
-    scene = _branched(rng, wide, first, stub, second)
-    y = wide / 2 + second - 1.0
-    way = [(0.8, 0.0), (first + wide / 2, 0.0), (first + wide / 2, y)]
-    return _Layout(scene, (0.8, 0.0, 0.0), way)
-
-
-def _t_corridor(rng: Rng) -> _Layout:
-    """A corridor that meets another; the goal is in one of its arms."""
-    wide, first, arm = float(rng.uniform(1.9, 2.3)), float(rng.uniform(5.0, 6.5)), 5.0
-    scene = _branched(rng, wide, first, 0.0, arm, both=True)
-    side = 1.0 if rng.random() < 0.5 else -1.0
-    way = [(0.8, 0.0), (first + wide / 2, 0.0), (first + wide / 2, side * (wide / 2 + arm - 1.0))]
-    return _Layout(scene, (0.8, 0.0, 0.0), way)
-
-
-def _branched(rng: Rng, wide: float, first: float, stub: float, arm: float, *, both: bool = False) -> Scene:
-    """Corridors along x and y as what solid blocks leave free; doors and pictures on the long walls."""
-    low = (0.0, -wide / 2 - (arm if both else 0.0))
-    high = (first + wide + stub, wide / 2 + arm)
-    lamps = [(x, 0.0) for x in np.arange(1.2, high[0], 2.6)]
-    lamps += [(first + wide / 2, y) for y in np.arange(wide / 2 + 1.4, high[1], 2.6)]
-    if both:
-        lamps += [(first + wide / 2, -y) for y in np.arange(wide / 2 + 1.4, high[1], 2.6)]
-    scene = _scene(rng, low, high, TEXTURED_WALLS, lamps)
-    blocks = [((0.0, first), (wide / 2, high[1]))]
-    if stub > 0:
-        blocks.append(((first + wide, high[0]), (wide / 2, high[1])))
-    if both:
-        blocks.append(((0.0, first), (low[1], -wide / 2)))
-    for x, y in blocks:
-        _solid_block(scene, rng, x, y)
-    line_wall(scene, Place(first / 2, wide / 2, np.pi), first - 0.6, rng, HEIGHT_M)
-    line_wall(scene, Place(first / 2, -wide / 2, 0.0), first - 0.6, rng, HEIGHT_M)
-    if stub == 0:
-        line_wall(scene, Place(first + wide, 0.0, np.pi / 2), 2 * arm + wide - 0.6, rng, HEIGHT_M)
-    else:
-        line_wall(scene, Place(first + wide, (wide + arm) / 2, np.pi / 2), arm - 0.6, rng, HEIGHT_M)
-    return scene
-
-
-def _solid_block(scene: Scene, rng: Rng, x: tuple[float, float], y: tuple[float, float]) -> None:
-    """Rooms that one cannot look into: a solid block up to the ceiling."""
-    paint = {face: random_paint(rng, TEXTURED_WALLS) for face in "frbl"}
-    centre = (0.5 * (x[0] + x[1]), 0.5 * (y[0] + y[1]), HEIGHT_M / 2)
-    scene.box(Place(0.0, 0.0, 0.0), centre, (x[1] - x[0], y[1] - y[0], HEIGHT_M), paint["f"], "wall", faces="frbl",
-              special=paint)  # fmt: skip
-
-
-def _two_rooms(rng: Rng) -> _Layout:
-    """Two furnished rooms, an open door between them and a closed one beside it."""
-    half, wide = float(rng.uniform(4.2, 4.8)), float(rng.uniform(4.4, 5.2))
-    scene = _scene(rng, (0.0, 0.0), (2 * half, wide), TEXTURED_WALLS, [(0.5 * half, wide / 2), (1.5 * half, wide / 2)])
-    open_at, closed_at = (0.3, 0.72) if rng.random() < 0.5 else (0.72, 0.3)
-    open_door = Opening(open_at * wide, float(rng.uniform(0.85, 1.0)), leaf_rad=float(rng.uniform(1.6, 1.8)))
-    closed_door = Opening(closed_at * wide, 0.9, leaf_rad=0.0)
-    doors = sorted((open_door, closed_door), key=lambda door: door.at_m)
-    wall(scene, rng, np.array([[half, 0.0], [half, wide]]), doors, TEXTURED_WALLS)
-    for centre, yaw, length in (
-        ((half / 2, 0.0), 0.0, half), ((half / 2, wide), np.pi, half), ((1.5 * half, 0.0), 0.0, half),
-        ((1.5 * half, wide), np.pi, half), ((2 * half, wide / 2), np.pi / 2, wide),
-    ):  # fmt: skip
-        furnish_wall(scene, Place(*centre, yaw), length - 1.8, rng, HEIGHT_M, density=0.7, door=False, pictures=0.8)
-    way = [(0.8, wide / 2), (half - 0.9, open_door.at_m), (half + 0.9, open_door.at_m), (2 * half - 1.3, wide / 2)]
-    return _Layout(scene, (0.8, wide / 2, 0.0), way, [_exit(half, open_door.at_m, (1.0, 0.0), open_door.width_m)])
-
-
-def _glass(rng: Rng) -> _Layout:
-    """The corridor with a pane of glass half way, from one wall to its middle."""
-    layout = _straight(rng, TEXTURED_WALLS, dressed=True)
-    wide = float(layout.scene.high_w[1] - layout.scene.low_w[1])
-    side = 1.0 if rng.random() < 0.5 else -1.0
-    pane = Box(np.array([6.0, side * wide / 4, HEIGHT_M / 2]), np.array([0.006, wide / 4, HEIGHT_M / 2]))
-    layout.panes.append(pane)
-    return layout
-
-
-def _mirror(rng: Rng) -> _Layout:
-    """The corridor that turns left; its dead end is a mirror from wall to wall."""
-    layout = _l_corridor(rng)
-    layout.mirror = True
-    return layout
-
-
-def _people(rng: Rng) -> _Layout:
-    """The corridor with a person who walks along one side of it, and one who crosses it."""
-    layout = _straight(rng, TEXTURED_WALLS, dressed=False)
-    side = 0.55 if rng.random() < 0.5 else -0.55
-    across = float(rng.uniform(7.5, 9.5))
-    layout.walkers.append(walker(rng, np.array([[3.5, side], [10.5, side]]), float(rng.uniform(0.5, 0.9))))
-    layout.walkers.append(walker(rng, np.array([[across, -0.6], [across, 0.6]]), float(rng.uniform(0.3, 0.6))))
-    return layout
-
-
-def _doors(rng: Rng) -> _Layout:
-    """A corridor with five doors to rooms on its left; two stand open, and the goal is behind the farther one."""
-    long, wide, deep, apart = 10.5, float(rng.uniform(2.0, 2.4)), 2.8, 2.1
-    lamps = [(x, y) for x in np.arange(apart / 2, long, apart) for y in (0.0, (wide + deep) / 2)]
-    scene = _scene(rng, (0.0, -wide / 2), (long, wide / 2 + deep), TEXTURED_WALLS, lamps)
-    is_open = set(rng.choice([1, 2, 3, 4], 2, replace=False).tolist())
-    doors = [
-        Opening(
-            (k + 0.5) * apart + float(rng.uniform(-0.15, 0.15)),
-            float(rng.uniform(0.85, 1.0)),
-            leaf_rad=float(rng.uniform(1.6, 1.8)) if k in is_open else 0.0,
-        )
-        for k in range(5)
-    ]
-    wall(scene, rng, np.array([[0.0, wide / 2], [long, wide / 2]]), doors, TEXTURED_WALLS)
-    for k in range(1, 5):
-        x = k * apart
-        wall(scene, rng, np.array([[x, wide / 2], [x, wide / 2 + deep]]), (), TEXTURED_WALLS)
-    line_wall(scene, Place(long / 2, -wide / 2, 0.0), long - 0.6, rng, HEIGHT_M)
-    goal = doors[max(is_open)].at_m
-    way = [(0.8, 0.0), (goal, 0.0), (goal, wide / 2 + 0.6 * deep)]
-    exits = [_exit(doors[k].at_m, wide / 2, (0.0, 1.0), doors[k].width_m) for k in sorted(is_open)]
-    return _Layout(scene, (0.8, 0.0, 0.0), way, exits)
-
-
-SITES: dict[str, Callable[[Rng], _Layout]] = {
-    "cluttered_room": _cluttered_room,
-    "corridor": _corridor,
-    "l_corridor": _l_corridor,
-    "two_rooms": _two_rooms,
-    "blank_walls": _blank_walls,
-    "t_corridor": _t_corridor,
-    "doors": _doors,
-    "glass": _glass,
-    "mirror": _mirror,
-    "people": _people,
-}
-"""The first five are static and judged; glass, mirror and people are flown, and nothing is promised."""
-JUDGED = tuple(SITES)[:5]
 
 
 def named_site(name: str, seed: int) -> Site:
-    """Build a site; the same name and seed give the same site.
+    """Build a site from a name or a scene file; the same scene and seed give the same site.
 
     Raises:
-        ValueError: If the name is unknown or the seed negative.
+        ConfigError: If there is no such scene, the file is wrong, or the seed negative.
     """
-    if name not in SITES:
-        raise ValueError(f"unknown world {name!r}; there are {', '.join(SITES)}")
     if seed < 0:
-        raise ValueError(f"a seed is at least 0, got {seed}")
-    rng = np.random.default_rng([*name.encode(), seed])
-    layout = _flyable(SITES[name], rng)
-    world = layout.scene.world(name)
-    if layout.mirror:
+        raise ConfigError(f"a seed is at least 0, got {seed}")
+    file = read_scene(scene_path(name))
+    rng = np.random.default_rng([*file.name.encode(), seed])
+    try:
+        if file.start is None or len(file.way) < 1:
+            raise ConfigError("start and way are missing: where a drone stands, and how it gets to its goal")
+        layout = _flyable(file, rng)
+        world = layout.scene.world(file.name)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from error
+    if file.mirror:
         world = mirrored(world)
-    x, y, yaw = layout.start
+    x, y, heading_deg = layout.start
+    c, s = np.cos(np.deg2rad(heading_deg)), np.sin(np.deg2rad(heading_deg))
     T_site_w = np.eye(4)
-    T_site_w[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    T_site_w[:2, :2] = [[c, -s], [s, c]]
     T_site_w[:2, 3] = x, y
     T_w_site = se3.inverse(T_site_w)
-    path = np.array([[*xy, GOAL_HEIGHT_M] for xy in layout.path]) @ T_w_site[:3, :3].T + T_w_site[:3, 3]
+    path = se3.transform(T_w_site, np.array([[*xy, GOAL_HEIGHT_M] for xy in layout.way]))
     exits = tuple(
         TrueExit(T_w_site[:3, :3] @ e.centre_w + T_w_site[:3, 3], T_w_site[:3, :3] @ e.normal_w, e.width_m, e.height_m)
         for e in layout.exits
     )
     solids = Solids(world, layout.panes)
-    return Site(name, seed, world, solids, T_site_w, path[-1], exits, path[:, :2], tuple(layout.walkers))
+    return Site(file.name, seed, world, solids, T_site_w, path[-1], exits, path[:, :2], tuple(layout.walkers))
 
 
-def _flyable(build: Callable[[Rng], _Layout], rng: Rng) -> _Layout:
-    """The first layout that leaves a way from the start to the goal: furniture at random may stand in a doorway."""
-    while True:
-        layout = build(rng)
-        if connected(layout.scene, layout.path, layout.panes):
+def place(name: str, rng: Rng, **given: float) -> World:
+    """A world of a scene to fly about in, without a task; ``given`` replaces values of the file.
+
+    Raises:
+        ConfigError: If there is no such scene or the file is wrong.
+    """
+    return _laid_out(read_scene(scene_path(name)), rng, given).scene.world(name)
+
+
+def _flyable(file: SceneFile, rng: Rng) -> _Layout:
+    """The first layout that leaves a way from the start to the goal."""
+    for _ in range(_TRIES):
+        layout = _laid_out(file, rng, {})
+        if connected(layout.scene, layout.way, layout.panes):
             return layout
+    raise ConfigError("nothing leaves a free way of 0.8 m from the start to the goal")
+
+
+def _laid_out(file: SceneFile, rng: Rng, given: dict[str, float]) -> _Layout:
+    value = Values(rng, file, given)
+    rooms = _rooms(file, value)
+    low, high = np.min([r[0] for r in rooms.values()], axis=0), np.max([r[1] for r in rooms.values()], axis=0)
+    bounds = np.append(low, 0.0), np.append(high, value(file.height))
+    scene = shell(rng, *bounds, value(file.texel), walls=file.walls, one_paint=file.one_paint)
+    scene.ambient = value(file.ambient)
+    layout = _Layout(scene, value(file.start or (0.0, 0.0, 0.0)))
+    solid = [np.array(value((b.x, b.y)), float).T for b in file.block]
+    for a, b in solid:
+        block(scene, a, b, dict.fromkeys("frbl", random_paint(rng, file.walls)))
+    _light(file, scene, rng, value, rooms)
+    for a, b in _between(rooms, solid):
+        block(scene, a, b, {face: random_paint(rng, file.walls) for face in "frbl"})
+    for part in _walls(file, rng, value, rooms, layout):
+        ends = np.full((2, 2), part.at)
+        ends[:, 1 - part.axis] = part.low, part.high
+        wall(scene, rng, ends, part.openings, file.walls)
+    for rug in file.rug:
+        dressing.rug(scene, rng, value(rug.x), value(rug.y))
+    for dress in file.dress:
+        _dress(scene, rng, dress, value, *_room(rooms, dress.room))
+    layout.way = [value(point) for point in file.way]
+    for things in file.obstacles:
+        a, b = _room(rooms, things.room)
+        kept = [(x, y) for x, y in layout.way if a[0] <= x <= b[0] and a[1] <= y <= b[1]]
+        (x0, x1), (y0, y1) = value((things.x, things.y))
+        stand_in_the_way(scene, rng, (x0, y0), (x1, y1), things.count, kept)
+    for glass in file.glass:
+        ends = _ends(value(glass.x), value(glass.y))
+        half = np.append(np.maximum(0.5 * np.abs(ends[1] - ends[0]), 0.006), 0.5 * bounds[1][2])
+        layout.panes.append(Box(np.append(ends.mean(0), half[2]), half))
+    ways = []
+    for person in file.person:
+        value.define(person.values)
+        ways.append(_ends(value(person.x), value(person.y)))
+    for person, ends in zip(file.person, ways, strict=True):
+        layout.walkers.append(walker(rng, ends, value(person.speed)))
+    return layout
+
+
+def _rooms(file: SceneFile, value: Values) -> dict[str, FloatArray]:
+    """Low and high corner ``(2, 2)`` of each room."""
+    if not file.room:
+        raise ConfigError("there is no [[room]]")
+    out: dict[str, FloatArray] = {}
+    for room in file.room:
+        corners = np.array(value((room.x, room.y)), float).T
+        if not (corners[1] - corners[0] > 0.5).all():
+            raise ConfigError(f"room {room.name!r}: x and y go from low to high, half a metre at least")
+        for other, (a, b) in out.items():
+            if (np.minimum(b, corners[1]) - np.maximum(a, corners[0]) > _EPS_M).all():
+                raise ConfigError(f"rooms {other!r} and {room.name!r} overlap")
+        if room.name in out:
+            raise ConfigError(f"two rooms are called {room.name!r}")
+        out[room.name] = corners
+    reached = {name for door in file.door for name in door.between} | {name for pair in file.open for name in pair}
+    for name in (*reached, *out):
+        _room(out, name)
+        if len(out) > 1 and name not in reached:
+            raise ConfigError(f"room {name!r} has no door: add a [[door]] between it and another, or name it in open")
+    return out
+
+
+def _room(rooms: dict[str, FloatArray], name: str) -> FloatArray:
+    if name not in rooms:
+        raise ConfigError(f"there is no room {name!r}, only {', '.join(rooms)}")
+    return rooms[name]
+
+
+def _light(file: SceneFile, scene: Scene, rng: Rng, value: Values, rooms: dict[str, FloatArray]) -> None:
+    """Lamps: those of the file, drawn ones, or one in the middle of each room."""
+    if file.random_lamps:
+        dressing.lamps_anywhere(scene, rng)
+        return
+    lamps = [(x, y, lamp.width) for lamp in file.lamps for x in _list(value(lamp.x)) for y in _list(value(lamp.y))]
+    for x, y, width in lamps or [(*corners.mean(0), 1.0) for corners in rooms.values()]:
+        scene.lamps_w.append(np.array([x, y, scene.high_w[2] - 0.1]))
+        dressing.hang_lamp(scene, scene.lamps_w[-1], value(width), 0.3)
+
+
+def _between(rooms: dict[str, FloatArray], solid: Sequence[FloatArray]) -> list[FloatArray]:
+    """Rectangles ``(2, 2)`` that fill what lies within the outer walls and in no room or block."""
+    taken = np.array([*rooms.values(), *solid])
+    xs, ys = (np.sort(taken[:, :, k], axis=None) for k in (0, 1))
+    xs, ys = (v[np.append(True, np.diff(v) > _EPS_M)] for v in (xs, ys))
+    out: list[FloatArray] = []
+    for x in pairwise(xs):
+        for y in reversed(list(pairwise(ys))):
+            cell = np.array([x, y]).T
+            middle = cell.mean(0)
+            if ((taken[:, 0] < middle) & (middle < taken[:, 1])).all(1).any():
+                continue
+            if out and out[-1][0, 0] == x[0] and out[-1][0, 1] == y[1]:
+                out[-1][0, 1] = y[0]
+            else:
+                out.append(cell)
+    return out
+
+
+def _walls(file: SceneFile, rng: Rng, value: Values, rooms: dict[str, FloatArray], layout: _Layout) -> list[_Wall]:
+    """Walls between rooms that touch, those along one line as one, with the file's doors; the open ones are exits."""
+    shared: dict[frozenset[str], _Wall] = {}
+    for (a, r), (b, s) in combinations(rooms.items(), 2):
+        for axis in (0, 1):
+            low, high = max(r[0, 1 - axis], s[0, 1 - axis]), min(r[1, 1 - axis], s[1, 1 - axis])
+            for first, second in ((r, s), (s, r)):
+                if high - low > _EPS_M and abs(first[1, axis] - second[0, axis]) < _EPS_M:
+                    shared[frozenset((a, b))] = _Wall(axis, first[1, axis], low, high)
+    for pair in file.open:
+        if shared.pop(frozenset(pair), None) is None:
+            raise ConfigError(f"open: rooms {pair[0]!r} and {pair[1]!r} do not touch")
+    walls: list[_Wall] = []
+    for part in sorted(shared.values(), key=lambda w: (-w.axis, w.at, w.low)):
+        last = walls[-1] if walls else None
+        if last and (last.axis, last.at) == (part.axis, part.at) and abs(last.high - part.low) < _EPS_M:
+            last.high = part.high
+        else:
+            walls.append(_Wall(part.axis, part.at, part.low, part.high))
+    for door in file.door:
+        value.define(door.values)
+        part = shared.get(frozenset(door.between))
+        where = f"door between {' and '.join(map(repr, door.between))}"
+        if part is None:
+            raise ConfigError(f"{where}: the rooms do not touch, or are open to each other")
+        is_open, at, width, height = (value(v) for v in (door.open, door.at, door.width, door.height))
+        leaf = (float(rng.uniform(*_OPEN_RAD)) if is_open else 0.0) if door.leaf or not is_open else None
+        if not part.low < at - width / 2 < at + width / 2 < part.high:
+            raise ConfigError(f"{where}: at {at:g}, {width:g} m wide, is not within {part.low:g} to {part.high:g}")
+        whole = next(w for w in walls if (w.axis, w.at) == (part.axis, part.at) and w.low <= at <= w.high)
+        for other in whole.openings:
+            if abs(other.at_m - (at - whole.low)) < 0.5 * (other.width_m + width):
+                raise ConfigError(f"{where}: overlaps another door")
+        whole.openings = sorted([*whole.openings, Opening(at - whole.low, width, height, leaf)], key=lambda o: o.at_m)
+        if is_open:
+            centre, normal = np.full(3, 0.5 * height), np.zeros(3)
+            centre[part.axis], centre[1 - part.axis] = part.at, at
+            normal[part.axis] = 1.0 if layout.start[part.axis] < part.at else -1.0
+            layout.exits.append(TrueExit(centre, normal, width, height))
+    return walls
+
+
+def _dress(scene: Scene, rng: Rng, dress: Dress, value: Values, low: FloatArray, high: FloatArray) -> None:
+    """Dress the walls of a room."""
+    margin, height = value(dress.margin), float(scene.high_w[2])
+
+    def foot(side: str) -> tuple[Place, float]:
+        place, length = side_of(low, high, side)
+        return place, length - 2 * margin
+
+    if dress.style == "doors":
+        for _ in range(int(rng.integers(2, 4))):
+            place, length = foot(dress.walls[int(rng.choice(len(dress.walls)))])
+            dressing.blind_door(scene, place.at(rng.uniform(-0.5, 0.5) * (length - 2.0), 0.0), rng)
+        return
+    order = rng.permutation(len(dress.walls)).tolist() if dress.shuffle else range(len(dress.walls))
+    for side in (dress.walls[k] for k in order):
+        place, length = foot(side)
+        if dress.style == "door":
+            dressing.blind_door(scene, place, rng)
+        elif dress.style == "corridor":
+            dressing.line_wall(scene, place, length, rng, height)
+        else:
+            dressing.furnish_wall(
+                scene, place, length, rng, height, density=value(dress.density), door=side == dress.door,
+                pictures=value(dress.pictures), names=dress.pieces,
+            )  # fmt: skip
+
+
+def _list(value: float | list[float]) -> list[float]:
+    return value if isinstance(value, list) else [value]
+
+
+def _ends(x: float | list[float], y: float | list[float]) -> FloatArray:
+    """Both ends ``(2, 2)`` of a line along x or y."""
+    return np.array([[_list(x)[k], _list(y)[k]] for k in (0, -1)], float)

@@ -8,46 +8,12 @@ from edgeslam_torch.synthetic.textures.noise import Rng, colour, fractal, shaded
 from edgeslam_torch.types import FloatArray
 
 WORDS = (
-    "EXIT",
-    "LIMIT",
-    "ROOM",
-    "PLAN",
-    "SAFETY",
-    "NOTICE",
-    "EDGE",
-    "LIGHT",
-    "NORTH",
-    "MOTION",
-    "FIELD",
-    "PAPER",
-    "STUDY",
-    "WORLD",
-    "SIGNAL",
-    "MAP",
-    "TODAY",
-    "CITY",
-    "SUMMER",
-    "GARDEN",
-    "SCIENCE",
-    "MUSIC",
-    "ATLAS",
-    "HISTORY",
-    "OPEN",
-    "DESIGN",
-    "ENERGY",
-    "NUMBER",
-    "THEORY",
-    "WINTER",
-    "VECTOR",
-    "RIVER",
-)
-FONTS = (
-    cv2.FONT_HERSHEY_SIMPLEX,
-    cv2.FONT_HERSHEY_DUPLEX,
-    cv2.FONT_HERSHEY_COMPLEX,
-    cv2.FONT_HERSHEY_TRIPLEX,
-    cv2.FONT_HERSHEY_SCRIPT_SIMPLEX,
-)
+    "EXIT", "LIMIT", "ROOM", "PLAN", "SAFETY", "NOTICE", "EDGE", "LIGHT", "NORTH", "MOTION", "FIELD", "PAPER",
+    "STUDY", "WORLD", "SIGNAL", "MAP", "TODAY", "CITY", "SUMMER", "GARDEN", "SCIENCE", "MUSIC", "ATLAS",
+    "HISTORY", "OPEN", "DESIGN", "ENERGY", "NUMBER", "THEORY", "WINTER", "VECTOR", "RIVER",
+)  # fmt: skip
+_FONTS = ("SIMPLEX", "DUPLEX", "COMPLEX", "TRIPLEX", "SCRIPT_SIMPLEX")
+FONTS = tuple(getattr(cv2, f"FONT_HERSHEY_{name}") for name in _FONTS)
 
 
 def landscape(rng: Rng, shape: tuple[int, int]) -> np.ndarray:

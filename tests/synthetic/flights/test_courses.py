@@ -1,7 +1,6 @@
 """Kinds of simulated flights: what each of them is there for."""
 
-from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,36 +9,30 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch import demo
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.synthetic.flights.courses import (
+    BLOCK_M,
     COURSES,
     LOW_LIGHT,
     RATE_HZ,
-    flown,
     simulated_camera,
 )
 from edgeslam_torch.synthetic.flights.degrade import degraded
 from edgeslam_torch.synthetic.flights.flight import FlightPlan
 from edgeslam_torch.synthetic.house.render import render
-from edgeslam_torch.synthetic.house.rooms import BLOCK_M
+from edgeslam_torch.synthetic.sites.build import place
 
 
 @cache
-def built(make, seed=1):
+def built(scene):
     """A world and the state of its random numbers: most courses fly through the same room."""
-    rng = np.random.default_rng(seed)
-    return make(rng), rng.bit_generator.state
-
-
-def world_again(make, rng):
-    """In place of ``make``."""
-    world, rng.bit_generator.state = built(make)
-    return world
+    rng = np.random.default_rng(1)
+    return place(scene, rng), rng.bit_generator.state
 
 
 @cache
 def flight_of(name):
-    course = COURSES[name]
-    world, flight, _ = flown(replace(course, world=partial(world_again, course.world)), 1)
-    return world, flight
+    course, rng = COURSES[name], np.random.default_rng()
+    world, rng.bit_generator.state = built(course.scene)
+    return world, course.pilot(rng, world, round(course.seconds * course.rate_hz), rate_hz=course.rate_hz)
 
 
 def turned_deg(flight):

@@ -20,15 +20,15 @@ from edgeslam_torch.synthetic.flights.flight import Flight, FlightPlan, fly
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, FIELDS, TelemetryFaults, simulate
 from edgeslam_torch.synthetic.flights.writer import DEPTH_PER_METRE, write_flight
 from edgeslam_torch.synthetic.house.render import render
-from edgeslam_torch.synthetic.house.rooms import room
 from edgeslam_torch.synthetic.house.world import World
+from edgeslam_torch.synthetic.sites.build import place
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 
 
 @pytest.fixture(scope="module")
 def home() -> World:
-    return room(np.random.default_rng(3))
+    return place("furnished_room", np.random.default_rng(3))
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.checkpoint import build_network
 from edgeslam_torch.models.layout import Widths
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.synthetic.house.rooms import blank_corridor
+from edgeslam_torch.synthetic.sites.build import place
 from edgeslam_torch.train.recipes import rendered_views
 from edgeslam_torch.train.recipes.places import mean_of
 from edgeslam_torch.train.views.rendered import stored_views
@@ -18,7 +18,7 @@ from edgeslam_torch.train.views.rendered import stored_views
 
 @pytest.fixture(scope="module")
 def corridor():
-    return blank_corridor(np.random.default_rng(0), length_m=8.0, width_m=3.0)
+    return place("long_blank_corridor", np.random.default_rng(0), long=8.0, wide=3.0)
 
 
 def test_oblique_poses_stand_near_a_wall_and_look_along_or_into_it(corridor) -> None:

@@ -1,0 +1,135 @@
+"""The walls of a scene: its outer shell, walls with openings and doors between its parts, and solid blocks."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.synthetic.house.furniture import picture_paint
+from edgeslam_torch.synthetic.house.scene import Paint, Place, Scene, random_paint
+from edgeslam_torch.types import FloatArray
+
+Rng = np.random.Generator
+FLOORS = ("wood", "wood", "carpet", "carpet", "tiles", "terrazzo", "concrete")
+CEILINGS = ("plaster", "plaster", "ceiling_panels", "concrete", "rough_plaster", "veneer")
+FRAMES = ("veneer", "plaster", "metal")
+SIDES = ("south", "east", "north", "west")
+"""Of a rectangle: low y, high x, high y, low x."""
+THICK_M = 0.12
+DOOR_HEIGHT_M = 2.05
+FRAME_M = 0.06
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """A way through a wall, from the floor up."""
+
+    at_m: float
+    """Its middle, along the wall from the wall's first end."""
+    width_m: float = 0.9
+    height_m: float = DOOR_HEIGHT_M
+    leaf_rad: float | None = None
+    """A door leaf hung at its first side, opened by this angle; None for no leaf, 0 for a closed door."""
+
+
+def shell(
+    rng: Rng, low: FloatArray, high: FloatArray, texel_m: float, *, walls: tuple[str, ...], one_paint: bool = False
+) -> Scene:
+    """Floor, ceiling, outer walls and skirting boards.
+
+    Args:
+        rng: Of the materials.
+        low: ``(3,)`` inner corner of the walls [m].
+        high: ``(3,)`` the other.
+        texel_m: Size of a texel.
+        walls: Materials to choose from.
+        one_paint: Whether all walls are painted alike.
+    """
+    scene = Scene(low, high, texel_m)
+    wide, deep, tall = high - low
+    floor, ceiling = random_paint(rng, FLOORS, turned=bool(rng.random() < 0.5)), random_paint(rng, CEILINGS)
+    x, y = np.array([wide, 0.0, 0.0]), np.array([0.0, deep, 0.0])
+    scene.surface(np.array([low[0], high[1], low[2]]), x, -y, floor, "floor")
+    scene.surface(np.array([low[0], low[1], high[2]]), x, y, ceiling, "ceiling")
+    paint, skirting = random_paint(rng, walls), random_paint(rng, FRAMES)
+    board = float(rng.uniform(0.06, 0.14))
+    for side in SIDES:
+        place, length = side_of(low, high, side)
+        if not one_paint and rng.random() < 0.3:
+            paint = random_paint(rng, walls)
+        scene.panel(place, (0, 0, tall / 2), length, tall, paint, "wall")
+        scene.box(place, (0, 0.007, board / 2), (length, 0.014, board), skirting, "skirting", faces="ft", inside=True)
+    return scene
+
+
+def side_of(low: FloatArray, high: FloatArray, side: str) -> tuple[Place, float]:
+    """Place at the foot of the middle of a rectangle's side, facing inwards, and the side's length."""
+    k = SIDES.index(side)
+    x, y = 0.5 * (low[:2] + high[:2]).astype(float)
+    x, y = ((x, low[1]), (high[0], y), (x, high[1]), (low[0], y))[k]
+    return Place(float(x), float(y), (0.0, np.pi / 2, np.pi, -np.pi / 2)[k]), float((high - low)[k % 2])
+
+
+def block(scene: Scene, low: FloatArray, high: FloatArray, paint: dict[str, Paint]) -> None:
+    """A solid between two corners of the floor ``(2,)``, up to the ceiling; a paint for each of its sides "frbl"."""
+    centre, size = 0.5 * (low + high), high - low
+    tall = float(scene.high_w[2])
+    scene.box(Place(0.0, 0.0, 0.0), (*centre, tall / 2), (*size, tall), paint["f"], "wall", faces="frbl", special=paint)
+
+
+def wall(scene: Scene, rng: Rng, ends_w: FloatArray, openings: Sequence[Opening], kinds: tuple[str, ...]) -> None:
+    """Build an upright wall between two points of the floor.
+
+    Args:
+        scene: What it is added to.
+        rng: Of its paint.
+        ends_w: ``(2, 2)`` first and second end of its middle line [m].
+        openings: In order along the wall, without overlap.
+        kinds: Materials to choose from.
+    """
+    along = ends_w[1] - ends_w[0]
+    length, yaw = float(np.linalg.norm(along)), float(np.arctan2(along[1], along[0]))
+    first = Place(float(ends_w[0, 0]), float(ends_w[0, 1]), yaw)
+    height = float(scene.high_w[2])
+    paint = {face: random_paint(rng, kinds) for face in "fb"}
+    reached = 0.0
+    for opening in openings:
+        low, high = opening.at_m - opening.width_m / 2, opening.at_m + opening.width_m / 2
+        _part(scene, first, (reached, low), (0.0, height), paint)
+        if opening.height_m < height:
+            _part(scene, first, (low, high), (opening.height_m, height), paint)
+            _frame(scene, first, opening, random_paint(rng, FRAMES))
+        if opening.leaf_rad is not None:
+            _leaf(scene, first.at(low, 0.0), opening, picture_paint(rng, "door"))
+        reached = high
+    _part(scene, first, (reached, length), (0.0, height), paint)
+
+
+def _part(scene: Scene, first: Place, x: tuple[float, float], z: tuple[float, float], paint: dict[str, Paint]) -> None:
+    """A part of a wall, painted all round."""
+    size = (x[1] - x[0], THICK_M, z[1] - z[0])
+    if size[0] < 1e-3 or size[2] < 1e-3:
+        return
+    centre = (0.5 * (x[0] + x[1]), 0.0, 0.5 * (z[0] + z[1]))
+    scene.box(first, centre, size, paint["f"], "wall", faces="frblu" if z[0] > 0 else "frbl", special=paint)
+
+
+def _frame(scene: Scene, first: Place, opening: Opening, paint: Paint) -> None:
+    """Door frame on both sides of the wall, around the opening."""
+    deep, tall = THICK_M + 0.04, opening.height_m
+    for side in (-1, 1):
+        x = opening.at_m + side * (opening.width_m + FRAME_M) / 2
+        size = (FRAME_M, deep, tall)
+        scene.box(first, (x, 0.0, tall / 2), size, paint, "door frame", faces="frbl", inside=True)
+    lintel = (opening.width_m + 2 * FRAME_M, deep, FRAME_M)
+    at = (opening.at_m, 0.0, tall + FRAME_M / 2)
+    scene.box(first, at, lintel, paint, "door frame", faces="frbltu", inside=True)
+
+
+def _leaf(scene: Scene, hinge: Place, opening: Opening, paint: Paint) -> None:
+    """A door's leaf, turned about its hinge towards the wall's front (+y)."""
+    turned = hinge.at(0.0, 0.0, yaw_rad=opening.leaf_rad or 0.0)
+    size = (opening.width_m - 0.01, 0.04, opening.height_m - 0.01)
+    centre = (opening.width_m / 2, 0.0, opening.height_m / 2)
+    edge, faces = Paint("veneer", 0, paint.tint), {"f": paint, "b": paint}
+    scene.box(turned, centre, size, edge, "door", faces="frblt", special=faces)
