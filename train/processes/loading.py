@@ -1,8 +1,8 @@
 """Batches drawn ahead by worker processes."""
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing.connection import wait
 from typing import Any, TypeVar
 
 import cv2
@@ -15,9 +15,6 @@ T = TypeVar("T")
 
 AHEAD = 2
 """Batches that each worker prefetches."""
-
-HEARD_S = 1.0
-"""Time in which the system tells of a worker's death: torch's handler of that signal raises, here and not later."""
 
 
 class WorkerError(EdgeSlamError):
@@ -69,8 +66,13 @@ def _unpacked(batches: Iterator[Any]) -> Iterator[Any]:
             if isinstance(found, Exception):
                 raise found
             yield found
-    except (ConnectionResetError, EOFError) as error:  # a worker died while it handed over a batch
-        time.sleep(HEARD_S)
+    except (ConnectionResetError, EOFError) as error:  # a worker dies while it hands over a batch
+        # Once it is dead and joined, torch's handler of that signal raises here, or finds nothing later.
+        workers = batches._workers  # type: ignore[attr-defined]
+        wait([worker.sentinel for worker in workers])
+        for worker in workers:
+            if not worker.is_alive():
+                worker.join()
         raise RuntimeError(f"DataLoader worker is gone: {error}") from error
 
 

@@ -1,1 +1,1 @@
-"""Recipes of weights that come with the package, beside `default_weights`."""
+"""One file a job: fine-tuning, distilling, the shipped weights."""

@@ -1,11 +1,11 @@
-"""Rendered corridors, halls, rooms of many sizes and the sites of flights, as training views kept in files.
+"""Rendered rooms, corridors, halls and sites of flights as training views, drawn once and kept in files.
 
-They are seen level, obliquely and from near. ``python -m edgeslam_torch.train.recipes.rendered_views DIR --places 3000
---processes 12`` draws them, while `weights` learns from what is there.
+``default`` learns from level views of rooms (`render_rooms`); ``near`` from views of `random_place`, also oblique and
+near ones. ``python -m edgeslam_torch.train.recipes.rendered_views DIR --places 3000 --processes 12`` draws the latter.
 """
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -18,11 +18,17 @@ from edgeslam_torch.synthetic.house.views import look, random_room, random_view
 from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.synthetic.sites.build import JUDGED, named_site, place
 from edgeslam_torch.terminal.progress import counted
-from edgeslam_torch.train.views.rendered import is_worth_learning
+from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.types import FloatArray
 
 Rng = np.random.Generator
 WIDTH, HEIGHT = 320, 240
+ROOM_FOCAL_PX = (210.0, 360.0)
+"""Of the 320 pixel wide images of rooms: 75 to 48 degrees across."""
+MIN_SPREAD = 1.5
+"""90th over 10th percentile of depth; below, a view shows a single surface."""
+KEEP_FLAT = 0.3
+"""Share of such views kept: drones do look at walls."""
 LEVEL_FOCAL_PX = (140.0, 380.0)
 """Of the 320 pixel wide images: 98 to 46 degrees across."""
 OBLIQUE_FOCAL_PX = (130.0, 300.0)
@@ -36,6 +42,42 @@ SITE_SEEDS = (1_000_000, 2_000_000)
 """Of sites to learn from; flights are judged on smaller ones."""
 TRIES = 8
 PLACES_A_FILE = 10
+
+
+def render_rooms(path: Path, rooms: int, views_per_room: int = 6, seed: int = 7) -> None:
+    """Draw level views of random rooms into a file; room r depends on (seed, r) alone."""
+
+    def views() -> Iterator[tuple[Camera, Rendered]]:
+        for r in counted(range(rooms), "rendering rooms", "room"):
+            rng = np.random.default_rng((seed, r))
+            world = random_room(rng)
+            for _ in range(views_per_room):
+                camera = _camera(_log(rng, *ROOM_FOCAL_PX))
+                yield camera, random_view(rng, camera, world)
+
+    _store(path, views())
+
+
+def stored_views(path: Path) -> list[View]:
+    """All views of a file."""
+    with np.load(path) as stored:
+        parts = zip(stored["image"], stored["depth"], stored["K"], strict=True)
+        return [View(image, depth.astype(np.float32), K) for image, depth, K in parts]
+
+
+def is_worth_learning(depth_m: FloatArray, lottery: float) -> bool:
+    """Whether a view shows depth, or, as ``lottery`` in [0, 1) is below `KEEP_FLAT`, some at least."""
+    known = depth_m[depth_m > 0]
+    if len(known) == 0:
+        return False
+    low, high = np.percentile(known, (10, 90))
+    return bool(high > MIN_SPREAD * low or lottery < KEEP_FLAT)
+
+
+def _store(path: Path, views: Iterable[tuple[Camera, Rendered]]) -> None:
+    found = [(view.image, view.depth_m.astype(np.float16), camera.K) for camera, view in views]
+    arrays = {name: np.array([row[k] for row in found]) for k, name in enumerate(("image", "depth", "K"))}
+    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
 
 def random_place(rng: Rng) -> World:
@@ -129,18 +171,15 @@ def render_files(folder: Path, places: int, seed: int = 21, processes: int = 1) 
 
 def _render_file(work: tuple[Path, int, int, int]) -> None:
     path, first, end, seed = work
-    images, depths, matrices = [], [], []
-    for p in range(first, end):
-        rng = np.random.default_rng((seed, p))
-        world = random_place(rng)
-        for camera, rendered in _views(rng, world):
-            if not is_worth_learning(rendered.depth_m, rng.random()):
-                continue
-            images.append(rendered.image)
-            depths.append(rendered.depth_m.astype(np.float16))
-            matrices.append(camera.K)
-    arrays = {"image": np.array(images), "depth": np.array(depths), "K": np.array(matrices)}
-    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
+
+    def views() -> Iterator[tuple[Camera, Rendered]]:
+        for p in range(first, end):
+            rng = np.random.default_rng((seed, p))
+            for camera, view in _views(rng, random_place(rng)):
+                if is_worth_learning(view.depth_m, rng.random()):
+                    yield camera, view
+
+    _store(path, views())
 
 
 def _views(rng: Rng, world: World) -> Iterator[tuple[Camera, Rendered]]:

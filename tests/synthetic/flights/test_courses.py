@@ -46,7 +46,7 @@ def path_m(flight):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] if n == "building" else []) for n in COURSES]
+    "name", [pytest.param(n, marks=[pytest.mark.slow] if n in ("building", "block") else []) for n in COURSES]
 )
 def test_course_keeps_clear_of_walls_and_furniture(name):
     world, flight = flight_of(name)

@@ -8,9 +8,7 @@ from edgeslam_torch.synthetic.flights.degrade import (
     CLEAN,
     CameraFaults,
     degraded,
-    random_faults,
     with_brightness,
-    with_jpeg,
     with_motion_blur,
     with_noise,
     with_vignetting,
@@ -62,28 +60,6 @@ def test_motion_blur_smears_along_the_motion_by_its_length() -> None:
     assert abs(changed.mean() - 79.5) < 0.6  # exposure is centred on the stamp
     across = with_motion_blur(step_image(), DEPTH, CAMERA, np.array([0, 1.0, 0, 0, 0, 0]), 0.1)
     np.testing.assert_array_equal(across[20:100], step_image()[20:100])
-
-
-def test_rotation_blurs_regardless_of_depth() -> None:
-    twist = np.array([0, 0, 0, 0, 0.5, 0])
-    a, b = (with_motion_blur(step_image(), DEPTH * k, CAMERA, twist, 0.1) for k in (1, 10))
-    np.testing.assert_array_equal(a, b)
-    assert not np.array_equal(a, step_image())
-
-
-def test_jpeg_is_close_and_optional() -> None:
-    image = step_image()
-    assert with_jpeg(image, 0) is image
-    assert np.abs(with_jpeg(image, 90).astype(int) - image).mean() < 3
-
-
-def test_degrading_is_repeatable_for_a_seed() -> None:
-    out = []
-    for _ in range(2):
-        rng = np.random.default_rng(9)
-        faults = random_faults(rng)
-        out.append(degraded(rng, step_image(), DEPTH, CAMERA, faults, stamp_s=1.0))
-    np.testing.assert_array_equal(out[0], out[1])
 
 
 def test_impossible_faults_are_refused() -> None:

@@ -54,11 +54,10 @@ def test_a_drone_leans_against_a_steady_wind() -> None:
     assert (lean == lean[0]).all()
 
 
-@pytest.mark.parametrize("name", [name for name in COURSES if name.startswith("windy")])
-def test_windy_courses_keep_clear_and_lean(name: str) -> None:
-    world, flight, _ = flown(COURSES[name], 0)
+def test_a_windy_course_keeps_clear_and_leans() -> None:
+    world, flight, _ = flown(COURSES["windy_blank_corridor"], 0)
     assert world.clearance(flight.T_w_b[:, :3, 3]).min() > 0.2
-    _, still, _ = flown(COURSES[name.removeprefix("windy_")], 0)
+    _, still, _ = flown(COURSES["blank_corridor"], 0)
     moved = flight.T_w_b[:, :3, 3] - still.T_w_b[:, :3, 3]
     assert 0.02 < moved[:, :2].std() < 0.3
     up = flight.T_w_b[:, :3, :3].mean(0)[:2, 2] - still.T_w_b[:, :3, :3].mean(0)[:2, 2]

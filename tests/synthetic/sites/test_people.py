@@ -1,4 +1,4 @@
-"""What moves, and what is seen and not there."""
+"""People who walk."""
 
 import numpy as np
 import pytest
@@ -6,19 +6,11 @@ import pytest
 from edgeslam_torch.drone.emulator.drone import DroneModel, Mode
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.render import render
+from edgeslam_torch.synthetic.house.views import look
 from edgeslam_torch.synthetic.sites.build import named_site
-from edgeslam_torch.synthetic.sites.mirror import REFLECTION, mirrored
 from edgeslam_torch.synthetic.sites.people import walker
 
 CAMERA = Camera(80, 60, 50.0, 50.0, 39.5, 29.5)
-
-
-def ahead(p):
-    """Level camera ``(4, 4)`` that looks along x."""
-    T = np.eye(4)
-    T[:3, :3] = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    T[:3, 3] = p
-    return T
 
 
 @pytest.fixture
@@ -61,7 +53,7 @@ def test_people_are_seen_and_felt_where_they_are_now():
     walkers = site.walkers
     for at_s in (0.0, 3.0):
         (x, y), _ = walkers[0].at(at_s)
-        T = ahead([x - 2.0, y, 1.1])
+        T = look(np.array([x - 2.0, y, 1.1]), 0.0)
         depth = render(site.painted(at_s), CAMERA, T, antialias=False).depth_m[30, 40]
         assert 1.5 < depth < 1.95  # half their breadth or depth nearer than their middle
         hit = (np.array([x - 2.0 + depth, y, 1.1]) - site.T_site_w[:3, 3]) @ site.T_site_w[:3, :3]
@@ -79,39 +71,3 @@ def test_a_hovering_drone_is_hit_by_who_walks_into_it(person):
     (contact,) = drone.contacts
     assert contact.speed_m_s == pytest.approx(0.5, abs=0.05), "the walker's speed; the drone hovers"
     assert not contact.crashed
-
-
-def test_a_mirror_shows_what_is_behind_the_camera_twice_as_far_as_the_mirror():
-    plain = named_site("l_corridor", 2).world
-    world = mirrored(plain)
-    wall = plain.bounds_w[1, 0]
-    x = wall - 1.5
-    seen = render(world, CAMERA, ahead([x, 0.1, 1.3]), antialias=False)
-    behind = ahead([x, 0.1, 1.3])
-    behind[:3, :3] = behind[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
-    turned = render(plain, CAMERA, behind, antialias=False)
-    # The mirror's picture is the view from behind it, left and right exchanged; far walls are seen at 1.5 + 1.5 + x.
-    assert seen.depth_m[30, 40] == pytest.approx(2 * 1.5 + turned.depth_m[30, 40], abs=0.01)
-    assert seen.depth_m[30, 40] == pytest.approx(2 * 1.5 + x, abs=0.01)
-    assert world.quads[seen.quad_id[30, 40]].name == REFLECTION
-
-
-def test_a_mirror_is_hit_and_what_it_shows_is_not():
-    site = named_site("mirror", 0)
-    wall = float(site.world.bounds_w[1, 0])
-    line = np.array([[wall - away, 0.0, 1.3] for away in (1.0, 0.5, 0.0)])
-    np.testing.assert_allclose(site.solids.distance(line), [1.0, 0.5, 0.0], atol=0.02)
-
-
-@pytest.mark.parametrize("seed", [0, 2])
-def test_open_doors_are_exits_and_the_others_are_shut(seed):
-    site = named_site("doors", seed)
-    assert len(site.exits) == 2
-    for way_out in site.exits:
-        assert site.clearance(way_out.centre_w[None])[0] == pytest.approx(0.5 * way_out.width_m, abs=0.05)
-        assert way_out.normal_w @ (way_out.centre_w - [way_out.centre_w[0], 0.0, 0.0]) > 0, "away from the corridor"
-    along = np.linspace(0.2, 9.6, 600)
-    line = np.stack([along, np.full(600, site.exits[0].centre_w[1]), np.full(600, 1.0)], axis=1)
-    open_ = site.clearance(line) > 0.3
-    openings = int(np.count_nonzero(np.diff(open_.astype(int)) == 1) + open_[0])
-    assert openings == 2

@@ -1,0 +1,23 @@
+"""The mean of two weights."""
+
+import pytest
+import torch
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.models.checkpoint import build_network
+from edgeslam_torch.models.layout import Widths
+from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train.recipes.weights import mean_of
+
+
+def test_the_mean_lies_between_and_is_of_one_network() -> None:
+    metadata = Metadata(input_height=32, input_width=64, focal_px=60.0)
+    small, other = Widths((4,) + (8,) * 13, (8,) * 5), Widths((4,) + (8,) * 13, (8,) * 4 + (4,))
+    torch.manual_seed(0)
+    a, b = (build_network(metadata, small) for _ in range(2))
+    state = mean_of(a, b, 0.25)
+    for name, x in a.state_dict().items():
+        y = b.state_dict()[name]
+        torch.testing.assert_close(state[name], 0.75 * x + 0.25 * y if x.is_floating_point() else x)
+    with pytest.raises(WeightsError, match="one network"):
+        mean_of(a, build_network(metadata, other), 0.5)
