@@ -170,8 +170,9 @@ def make_default(data: Path, out: Path, phases: Sequence[Phase] = (BROAD, SETTLE
     }
     watched = {name: load_depth_folder(data / name, 640, stride=6).views for name in watch}
     validate = Scores(metadata, {RENDERED: held_out, **watched})
-    network: DepthModule = build_network(metadata)
-    load_imagenet_encoder(network, data / IMAGENET)
+    new = build_network(metadata)
+    load_imagenet_encoder(new, data / IMAGENET)
+    network: DepthModule = new
     for phase, name in zip(phases, ("broad", "settle"), strict=True):
         network = phase.run(network, metadata, pools, out / name, validate)
     save_checkpoint(network, calibrate_sigma(network, metadata, held_out), out / "default.safetensors", half=True)

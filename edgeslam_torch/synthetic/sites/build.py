@@ -27,6 +27,8 @@ SITES = (*JUDGED, "t_corridor", "doors", "glass", "mirror", "people")
 """Scenes with a start and a goal. The first five are static and judged; glass, mirror and people are flown, and nothing
 is promised."""
 _EPS_M = 1e-6
+_MAX_M = 200.0
+"""Extent of a scene: beyond, the search for a free way takes gigabytes."""
 _TRIES = 100
 """Furniture at random may stand in a doorway: another draw has it elsewhere."""
 _OPEN_RAD = (1.6, 1.8)
@@ -73,7 +75,7 @@ def named_site(name: str, seed: int) -> Site:
             raise ConfigError("start and way are missing: where a drone stands, and how it gets to its goal")
         layout = _flyable(file, rng)
         world = layout.scene.world(file.name)
-    except ConfigError as error:
+    except (ConfigError, ValueError, TypeError) as error:
         raise ConfigError(f"{name}: {error}") from error
     if file.mirror:
         world = mirrored(world)
@@ -133,6 +135,9 @@ def _laid_out(file: SceneFile, rng: Rng, given: dict[str, float]) -> _Layout:
     for dress in file.dress:
         _dress(scene, rng, dress, value, *_room(rooms, dress.room))
     layout.way = [value(point) for point in file.way]
+    for point in (layout.start[:2], *layout.way) if file.start else ():
+        if not any((a < point).all() and (point < b).all() for a, b in rooms.values()):
+            raise ConfigError(f"start and way: [{point[0]:g}, {point[1]:g}] is in no room")
     for things in file.obstacles:
         a, b = _room(rooms, things.room)
         kept = [(x, y) for x, y in layout.way if a[0] <= x <= b[0] and a[1] <= y <= b[1]]
@@ -166,6 +171,9 @@ def _rooms(file: SceneFile, value: Values) -> dict[str, FloatArray]:
         if room.name in out:
             raise ConfigError(f"two rooms are called {room.name!r}")
         out[room.name] = corners
+    corners = np.array(list(out.values()))
+    if np.ptp(corners, axis=(0, 1)).max() > _MAX_M:
+        raise ConfigError(f"the rooms extend over more than {_MAX_M:g} m")
     reached = {name for door in file.door for name in door.between} | {name for pair in file.open for name in pair}
     for name in (*reached, *out):
         _room(out, name)
@@ -231,23 +239,23 @@ def _walls(file: SceneFile, rng: Rng, value: Values, rooms: dict[str, FloatArray
             walls.append(_Wall(part.axis, part.at, part.low, part.high))
     for door in file.door:
         value.define(door.values)
-        part = shared.get(frozenset(door.between))
+        edge = shared.get(frozenset(door.between))
         where = f"door between {' and '.join(map(repr, door.between))}"
-        if part is None:
+        if edge is None:
             raise ConfigError(f"{where}: the rooms do not touch, or are open to each other")
         is_open, at, width, height = (value(v) for v in (door.open, door.at, door.width, door.height))
         leaf = (float(rng.uniform(*_OPEN_RAD)) if is_open else 0.0) if door.leaf or not is_open else None
-        if not part.low < at - width / 2 < at + width / 2 < part.high:
-            raise ConfigError(f"{where}: at {at:g}, {width:g} m wide, is not within {part.low:g} to {part.high:g}")
-        whole = next(w for w in walls if (w.axis, w.at) == (part.axis, part.at) and w.low <= at <= w.high)
+        if not edge.low < at - width / 2 < at + width / 2 < edge.high:
+            raise ConfigError(f"{where}: at {at:g}, {width:g} m wide, is not within {edge.low:g} to {edge.high:g}")
+        whole = next(w for w in walls if (w.axis, w.at) == (edge.axis, edge.at) and w.low <= at <= w.high)
         for other in whole.openings:
             if abs(other.at_m - (at - whole.low)) < 0.5 * (other.width_m + width):
                 raise ConfigError(f"{where}: overlaps another door")
         whole.openings = sorted([*whole.openings, Opening(at - whole.low, width, height, leaf)], key=lambda o: o.at_m)
         if is_open:
             centre, normal = np.full(3, 0.5 * height), np.zeros(3)
-            centre[part.axis], centre[1 - part.axis] = part.at, at
-            normal[part.axis] = 1.0 if layout.start[part.axis] < part.at else -1.0
+            centre[edge.axis], centre[1 - edge.axis] = edge.at, at
+            normal[edge.axis] = 1.0 if layout.start[edge.axis] < edge.at else -1.0
             layout.exits.append(TrueExit(centre, normal, width, height))
     return walls
 

@@ -65,7 +65,7 @@ def _lamp(scene: Scene, place: Place, rng: Rng) -> None:
     floor_lamp(scene, place, rng)
 
 
-def connected(scene: Scene, places: Sequence[tuple[float, float]], unseen: Sequence[Box] = ()) -> bool:
+def connected(scene: Scene, places: Sequence[Sequence[float]], unseen: Sequence[Box] = ()) -> bool:
     """Whether one can go between places of the floor at heights of flight, `PASSAGE_M` from every solid, and down to
     the floor at the first of them.
 

@@ -6,7 +6,7 @@ Where a number is expected, text may stand: arithmetic over the file's values, w
 
 import ast
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -181,10 +181,9 @@ def read_scene(path: Path) -> SceneFile:
             raise ConfigError(f"{path}: {name} is a list of tables; write [[{name}]] and its keys below")
         parts[name] = tuple(_record(kind, entry, f"{path}: [[{name}]] {k}") for k, entry in enumerate(entries, 1))
     scene = dataclasses.replace(_record(SceneFile, table, str(path)), name=path.stem, **parts)
-    for where, given, known in (
-        ("walls", scene.walls, MATERIALS),
-        *((f"[[dress]] {k} pieces", dress.pieces, PIECES) for k, dress in enumerate(scene.dress, 1)),
-    ):
+    named: list[tuple[str, tuple[str, ...], Iterable[str]]] = [("walls", scene.walls, MATERIALS)]
+    named += [(f"[[dress]] {k} pieces", dress.pieces, PIECES) for k, dress in enumerate(scene.dress, 1)]
+    for where, given, known in named:
         if not given or set(given) - set(known):
             raise ConfigError(f"{path}: {where} must be some of {', '.join(known)}, got {', '.join(given)}")
     return scene
@@ -265,7 +264,9 @@ class Values:
             return value
         try:
             tree = ast.parse(value, mode="eval")
-            if any(not isinstance(node, _SYNTAX) for node in ast.walk(tree)):
+            nodes = list(ast.walk(tree))
+            texts = [node for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str | bytes)]
+            if texts or any(not isinstance(node, _SYNTAX) for node in nodes):
                 raise ConfigError(f"{value!r} is not arithmetic")
             names = self._functions | self._known
             return eval(compile(tree, "scene", "eval"), {"__builtins__": {}}, names)
