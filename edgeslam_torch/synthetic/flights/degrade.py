@@ -1,4 +1,4 @@
-"""Faults of a cheap camera: light changes, noise, blur, vignetting, compression."""
+"""Faults of a cheap camera: light changes, noise, blur, vignetting."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,8 +23,6 @@ class CameraFaults:
     exposure_amplitude: float = 0.06
     """Slow brightness change, as a share (auto exposure)."""
     exposure_period_s: float = 7.0
-    gamma: float = 1.0
-    """Exponent on brightness in [0, 1]."""
     read_noise: float = 1.2
     """Standard deviation [grey levels]."""
     shot_noise: float = 0.12
@@ -33,28 +31,21 @@ class CameraFaults:
     """Share of light lost in the image's corners."""
     shutter_s: float = 0.006
     """Exposure time, for motion blur."""
-    jpeg_quality: int = 0
-    """1 to 100; 0 for none."""
     gain: float = 1.0
     """Share of the light that reaches the sensor; the noise does not shrink with it."""
 
     def __post_init__(self) -> None:
-        if (
-            min(self.read_noise, self.shot_noise, self.shutter_s, self.vignetting) < 0
-            or min(self.gamma, self.gain) <= 0
-        ):
-            raise ValueError(f"noise, shutter and vignetting must not be negative, gamma and gain positive: {self}")
-        if not 0 <= self.jpeg_quality <= 100:
-            raise ValueError(f"jpeg_quality must lie in 0..100, got {self.jpeg_quality}")
+        if min(self.read_noise, self.shot_noise, self.shutter_s, self.vignetting) < 0 or self.gain <= 0:
+            raise ValueError(f"noise, shutter and vignetting must not be negative, the gain positive: {self}")
 
 
-CLEAN = CameraFaults(0.0, 7.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0)
+CLEAN = CameraFaults(exposure_amplitude=0.0, read_noise=0.0, shot_noise=0.0, vignetting=0.0, shutter_s=0.0)
 """A perfect camera."""
 
 
-def with_brightness(image: np.ndarray, gain: float = 1.0, offset: float = 0.0, gamma: float = 1.0) -> np.ndarray:
-    """``255 * (image / 255) ** gamma * gain + offset`` in grey levels, clipped to 8 bits."""
-    levels = 255.0 * (np.arange(256) / 255.0) ** gamma * gain + offset
+def with_brightness(image: np.ndarray, gain: float) -> np.ndarray:
+    """``image * gain`` in grey levels, clipped to 8 bits."""
+    levels = 255.0 * (np.arange(256) / 255.0) * gain
     return cv2.LUT(image, np.clip(levels + 0.5, 0, 255).astype(np.uint8))
 
 
@@ -96,14 +87,6 @@ def _vignette(h: int, w: int, channels: int, loss: float) -> np.ndarray:
     x, y = (np.arange(w) - (w - 1) / 2) / (w / 2), (np.arange(h) - (h - 1) / 2) / (h / 2)
     gain = np.rint(255.0 * (1.0 - 0.5 * loss * (x[None] ** 2 + y[:, None] ** 2)))
     return cv2.merge([(np.clip(gain, 0, 255) / 255.0).astype(np.float32)] * channels)
-
-
-def with_jpeg(image: np.ndarray, quality: int) -> np.ndarray:
-    """Compressed and decompressed; quality 0 leaves it alone."""
-    if quality == 0:
-        return image
-    _, packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_UNCHANGED))
 
 
 def with_motion_blur(
@@ -170,21 +153,7 @@ def degraded(
     if twist_c is not None:
         image = with_motion_blur(image, depth_m, camera, twist_c, faults.shutter_s)
     gain = faults.gain * (1.0 + faults.exposure_amplitude * np.sin(2 * np.pi * stamp_s / faults.exposure_period_s))
-    if gain != 1.0 or faults.gamma != 1.0:
-        image = with_brightness(image, gain=float(gain), gamma=faults.gamma)
+    if gain != 1.0:
+        image = with_brightness(image, float(gain))
     image = with_vignetting(image, faults.vignetting)
-    image = with_noise(rng, image, faults.read_noise, faults.shot_noise)
-    return with_jpeg(image, faults.jpeg_quality)
-
-
-def random_faults(rng: Rng) -> CameraFaults:
-    """A camera of random quality, for training depth."""
-    return CameraFaults(
-        exposure_amplitude=0.0,
-        gamma=float(np.exp(rng.normal(0.0, 0.18))),
-        read_noise=float(rng.uniform(0.0, 3.0)),
-        shot_noise=float(rng.uniform(0.0, 0.35)),
-        vignetting=float(rng.uniform(0.0, 0.4)),
-        shutter_s=0.0,
-        jpeg_quality=int(rng.integers(50, 96)) if rng.random() < 0.5 else 0,
-    )
+    return with_noise(rng, image, faults.read_noise, faults.shot_noise)

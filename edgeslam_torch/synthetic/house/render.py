@@ -6,7 +6,7 @@ Borders are smoothed by five samples per pixel: its centre and, shared with its 
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -64,12 +64,13 @@ def render(world: World, camera: Camera, T_w_c: FloatArray, *, antialias: bool =
 
     Args:
         world: What to look at.
-        camera: Intrinsics; with distortion the image, depth and indices are those of the distorted pixels.
+        camera: Intrinsics without distortion.
         T_w_c: Pose, ``(4, 4)``.
         antialias: Smooth the borders of quads.
+
+    Raises:
+        ValueError: If the camera has distortion.
     """
-    if camera.is_distorted:
-        return _render_distorted(world, camera, T_w_c, antialias)
     image, iz, ids = _drawn(world, camera, T_w_c, antialias)
     with np.errstate(divide="ignore"):
         depth = np.where(iz > 0, np.float32(1.0) / iz, np.float32(0.0))
@@ -78,8 +79,6 @@ def render(world: World, camera: Camera, T_w_c: FloatArray, *, antialias: bool =
 
 def picture(world: World, camera: Camera, T_w_c: FloatArray) -> np.ndarray:
     """The image of `render` alone, ``(H, W, 3)`` uint8 BGR, borders not smoothed: for live pictures."""
-    if camera.is_distorted:
-        return _render_distorted(world, camera, T_w_c, antialias=False).image
     return _drawn(world, camera, T_w_c, antialias=False)[0]
 
 
@@ -87,6 +86,8 @@ def _drawn(
     world: World, camera: Camera, T_w_c: FloatArray, antialias: bool
 ) -> tuple[np.ndarray, FloatArray, np.ndarray]:
     """Image, inverse depth, and quad index int16."""
+    if camera.is_distorted:
+        raise ValueError("simulated cameras have no distortion")
     polygons = _project(world, camera, T_w_c)
     iz, ids, spans = _depth_pass(polygons, camera.width, camera.height, 0.0)
     image = np.empty((camera.height, camera.width, 3), np.uint8)
@@ -311,34 +312,3 @@ def _smooth_borders(image: np.ndarray, ids: np.ndarray, polygons: list[_Polygon]
         at = position[index]
         blended += np.where(lonely[at, None], own, colour[at])
     flat[pixel] = (blended * 0.125 + 0.5).astype(np.uint8)
-
-
-def _render_distorted(world: World, camera: Camera, T_w_c: FloatArray, antialias: bool) -> Rendered:
-    """Render a pinhole view that covers the distorted one, look it up, and take depth from the planes."""
-    grid_v, grid_u = np.mgrid[0 : camera.height, 0 : camera.width]
-    uv = np.stack([grid_u.ravel(), grid_v.ravel()], axis=1)
-    ideal = camera.undistort_points(uv).astype(np.float64)
-    low, high = np.floor(ideal.min(0)) - 1.0, np.ceil(ideal.max(0)) + 1.0
-    width, height = (high - low + 1).astype(int).tolist()
-    wide = replace(
-        camera,
-        width=width,
-        height=height,
-        cx=camera.cx - low[0],
-        cy=camera.cy - low[1],
-        distortion=(0.0, 0.0, 0.0, 0.0, 0.0),
-    )
-    view = render(world, wide, T_w_c, antialias=antialias)
-    local = ideal - low
-    shape = (camera.height, camera.width)
-    map_x, map_y = (local[:, i].astype(np.float32).reshape(shape) for i in (0, 1))
-    image = looked_up(view.image, map_x, map_y)
-    nearest = np.rint(local).astype(np.int64)
-    ids = view.quad_id[nearest[:, 1], nearest[:, 0]]
-    planes = np.zeros((len(world.quads) + 1, 3))
-    for polygon in _project(world, wide, T_w_c):
-        planes[polygon.quad] = polygon.st_from_uv[2]
-    iz = np.einsum("ni,ni->n", planes[ids], np.column_stack([local, np.ones(len(local))]))
-    depth = np.zeros(len(iz), np.float32)
-    depth[iz > 0] = 1.0 / iz[iz > 0]
-    return Rendered(image, depth.reshape(shape), ids.reshape(shape))

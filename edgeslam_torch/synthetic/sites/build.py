@@ -133,7 +133,7 @@ def _laid_out(file: SceneFile, rng: Rng, given: dict[str, float]) -> _Layout:
     for rug in file.rug:
         dressing.rug(scene, rng, value(rug.x), value(rug.y))
     for dress in file.dress:
-        _dress(scene, rng, dress, value, *_room(rooms, dress.room))
+        _dress(scene, rng, dress, file.pieces, value, *_room(rooms, dress.room))
     layout.way = [value(point) for point in file.way]
     for point in (layout.start[:2], *layout.way) if file.start else ():
         if not any((a < point).all() and (point < b).all() for a, b in rooms.values()):
@@ -260,7 +260,9 @@ def _walls(file: SceneFile, rng: Rng, value: Values, rooms: dict[str, FloatArray
     return walls
 
 
-def _dress(scene: Scene, rng: Rng, dress: Dress, value: Values, low: FloatArray, high: FloatArray) -> None:
+def _dress(
+    scene: Scene, rng: Rng, dress: Dress, pieces: tuple[str, ...], value: Values, low: FloatArray, high: FloatArray
+) -> None:
     """Dress the walls of a room."""
     margin, height = value(dress.margin), float(scene.high_w[2])
 
@@ -283,7 +285,7 @@ def _dress(scene: Scene, rng: Rng, dress: Dress, value: Values, low: FloatArray,
         else:
             dressing.furnish_wall(
                 scene, place, length, rng, height, density=value(dress.density), door=side == dress.door,
-                pictures=value(dress.pictures), names=dress.pieces,
+                pictures=value(dress.pictures), names=dress.pieces or pieces,
             )  # fmt: skip
 
 

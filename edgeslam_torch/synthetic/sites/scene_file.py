@@ -65,7 +65,8 @@ class Dress:
     """Share of the wall that is furnished."""
     pictures: Number = 0.8
     """Share of the free upper part that is hung."""
-    pieces: tuple[str, ...] = tuple(PIECES)
+    pieces: tuple[str, ...] = ()
+    """Furniture to choose from; the scene's when empty."""
     door: Side | None = None
     """The wall with a shut door among the furniture."""
     shuffle: bool = False
@@ -139,6 +140,8 @@ class SceneFile:
     """Share of the light that comes from everywhere."""
     walls: tuple[str, ...] = ("rough_plaster", "wallpaper", "bricks", "concrete", "plaster")
     """Materials to choose from."""
+    pieces: tuple[str, ...] = tuple(PIECES)
+    """Furniture to choose from; what stands twice is twice as frequent."""
     one_paint: bool = False
     """Whether all outer walls are painted alike."""
     random_lamps: bool = False
@@ -182,7 +185,8 @@ def read_scene(path: Path) -> SceneFile:
         parts[name] = tuple(_record(kind, entry, f"{path}: [[{name}]] {k}") for k, entry in enumerate(entries, 1))
     scene = dataclasses.replace(_record(SceneFile, table, str(path)), name=path.stem, **parts)
     named: list[tuple[str, tuple[str, ...], Iterable[str]]] = [("walls", scene.walls, MATERIALS)]
-    named += [(f"[[dress]] {k} pieces", dress.pieces, PIECES) for k, dress in enumerate(scene.dress, 1)]
+    named += [("pieces", scene.pieces, PIECES)]
+    named += [(f"[[dress]] {k} pieces", d.pieces, PIECES) for k, d in enumerate(scene.dress, 1) if d.pieces]
     for where, given, known in named:
         if not given or set(given) - set(known):
             raise ConfigError(f"{path}: {where} must be some of {', '.join(known)}, got {', '.join(given)}")
