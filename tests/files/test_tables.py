@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.tables import number, read_table
@@ -14,10 +16,13 @@ def written(tmp_path, text, encoding="utf-8"):
     return path
 
 
-@pytest.mark.parametrize("separator", [" ", "\t", ",", ";", ", ", " \t ", "; "])
-@pytest.mark.parametrize("header", ["", "# t x y\n", "t{0}x{0}y\n", "#t{0}x{0}y\n"])
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le"])
-@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.sampled_from([" ", "\t", ",", ";", ", ", " \t ", "; "]),
+    st.sampled_from(["", "# t x y\n", "t{0}x{0}y\n", "#t{0}x{0}y\n"]),
+    st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "utf-16-le"]),
+    st.sampled_from(["\n", "\r\n", "\r"]),
+)
 def test_numbers_are_read_whatever_the_separator_header_and_encoding(tmp_path, separator, header, encoding, end):
     lines = [separator.join(map(str, row)) for row in ROWS]
     text = (header.format(separator) + "\n".join(lines) + "\n").replace("\n", end)

@@ -26,7 +26,7 @@ def length(T_w_c):
     return np.linalg.norm(np.diff(T_w_c[:, :3, 3], axis=0), axis=1).sum()
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
+@pytest.mark.parametrize("factor", [0.5, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_later_depth_maps_correct_a_wrong_first_one(factor):
     """The first depth map sets the map's scale; a dozen later ones measure it in metres."""
     known, calls = panels().depth_function(), []
