@@ -284,9 +284,9 @@ class WindowConfig:
     """Whiten edge and corner terms by the robust scales of their residuals (paper: "adaptive weighting")."""
     rounds: int = 1
     """Rounds of edge association and refinement."""
-    edges_per_keyframe: int = 800
+    edges_per_keyframe: int = 400
     """Edge pixels used per keyframe."""
-    targets: int = 3
+    targets: int = 2
     """Neighbouring keyframes in which each edge pixel is associated."""
     in_flight: str = "few"
     """Windows in flight with edge and corner terms: ``off``; ``few``: if the newest keyframe's image has few strong
@@ -295,7 +295,7 @@ class WindowConfig:
     """Subset of ``alignment``, ``cycle``, ``angle`` and ``collinearity`` in flight, each in the form selected above or,
     if that is off, its default."""
     in_flight_edges: int = 300
-    """Edge pixels per keyframe in flight, each associated in two neighbours."""
+    """Edge pixels per keyframe in flight."""
     solver: str = "compiled"
     """Residuals by ``compiled`` loops, or by the ``modules`` of `edgeslam_torch.losses`: same values, far slower."""
     telemetry: str = "every"
@@ -329,7 +329,7 @@ class WindowConfig:
         for loss, (default, none) in _FLYING_FORMS.items():
             chosen = getattr(self, loss)
             form[loss] = none if loss not in self.in_flight_losses else default if chosen == none else chosen
-        return replace(self, edges_per_keyframe=self.in_flight_edges, targets=2, **form)
+        return replace(self, edges_per_keyframe=self.in_flight_edges, **form)
 
     @property
     def uses_edges(self) -> bool:

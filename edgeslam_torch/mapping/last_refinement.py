@@ -1,4 +1,4 @@
-"""Refinement of the whole map after the last keyframe: anchors first, then with edges and corners."""
+"""Refinement of the whole map after the last keyframe, with edges and corners."""
 
 import logging
 from dataclasses import replace
@@ -51,7 +51,9 @@ def lm_config(config: WindowConfig) -> LmConfig:
 def last_refinement(
     slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: WindowConfig, telemetry: TelemetryModel | None = None
 ) -> WindowResult | None:
-    """Refine all keyframes and anchors, merge duplicates, measure the remaining edges, refine with edges.
+    """Merge duplicate anchors, measure the remaining edges, refine everything once.
+
+    Windows in flight end at their minimum, so that no refinement of the anchors alone is needed before.
 
     Args:
         slam_map: Refined in place.
@@ -64,26 +66,17 @@ def last_refinement(
         Result of the last solver run; None if there was nothing to refine.
     """
     lm = replace(lm_config(config), max_iterations=ITERATIONS)
-    stated = replace(lm, losses=True)
-    with_edges = config.uses_edges or config.uses_corners
-    result = None
-    if (
-        config.reprojection != "off"
-        and refine_all(slam_map, camera, lm, telemetry, Weight.WIDE, ALIKE_AT_THE_END) is not None
-    ):
+    if config.reprojection != "off":
         with slam_map.lock:
             drift_px = max(reobserve_all(slam_map, camera), default=0.0)
         if drift_px > MAX_DRIFT_PX:
             refine_all(slam_map, camera, lm, telemetry, Weight.EXACT, ALIKE_AT_THE_END)
         with slam_map.lock:
             fuse_all(slam_map, camera)
-        result = refine_all(slam_map, camera, lm if with_edges else stated, telemetry, Weight.EXACT, ALIKE_AT_THE_END)
     edges.update(everything=True)
     with slam_map.lock:
         edges.follow_anchors()
-    if with_edges:
-        result = refine_with_edges(slam_map, camera, edges, stated, config, telemetry) or result
-    return result
+    return refine_with_edges(slam_map, camera, edges, replace(lm, losses=True), config, telemetry)
 
 
 def refine_with_edges(
@@ -113,7 +106,7 @@ def refine_with_edges(
         problem = placed.problem
         if config.reprojection == "off":
             problem = _without_points(problem)
-        if not placed.has_terms:
+        if len(problem.obs_pose) == 0 and not placed.has_terms:
             return result
         if config.adaptive:
             scales = scales.updated(term_residuals(problem))

@@ -1,6 +1,7 @@
 """The semi-dense edge map: edge points stay with the keyframe that measured them and move with its pose."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -166,8 +167,8 @@ class EdgeMap:
         again, _ = self._measured(keyframe, host.uv, host.normal, host.colour)
         if again is None:
             return host
-        for other in self._overlapping(keyframe, [h for h in self.hosts if h is not host]):
-            again.observations[self._agreeing(again, other)[0]] += 1
+        for mine, _ in self._agreeing(again, self._overlapping(keyframe, [h for h in self.hosts if h is not host])):
+            again.observations[mine] += 1
         return again
 
     def _is_off(self, host: EdgePoints, keyframe: Keyframe) -> bool:
@@ -182,9 +183,8 @@ class EdgeMap:
     def add(self, points: EdgePoints) -> None:
         """Add the measured edges of a keyframe; remove others above the limit."""
         with self.map.lock:
-            recent = self.hosts[-RECENT_HOSTS:]
-            for other in self._overlapping(self.map.keyframes[points.keyframe_id], recent):
-                mine, theirs = self._agreeing(points, other)
+            others = self._overlapping(self.map.keyframes[points.keyframe_id], self.hosts[-RECENT_HOSTS:])
+            for other, (mine, theirs) in zip(others, self._agreeing(points, others), strict=True):
                 points.observations[mine] += 1
                 other.observations[theirs] += 1
             self.hosts.append(points)
@@ -228,20 +228,20 @@ class EdgeMap:
         near = {k.id for k in self.map.covisible(keyframe, 3 * self.config.targets)}
         return [h for h in hosts if h.keyframe_id in near][-8:]
 
-    def _agreeing(self, points: EdgePoints, other: EdgePoints) -> tuple[IntArray, IntArray]:
-        """Indices of points with consistent depth in both keyframes: the cycle of paper eqs. (17)-(22), as a test."""
-        if len(points.uv) == 0:
-            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    def _agreeing(self, points: EdgePoints, others: list[EdgePoints]) -> Iterator[tuple[IntArray, IntArray]]:
+        """Indices of points with consistent depth in a keyframe and in each of others: the cycle of paper eqs.
+        (17)-(22), as a test."""
         painted = PaintedEdges.of(points.uv, (self.camera.width, self.camera.height))
-        T_p_o = self.map.pose_of(points.keyframe_id) @ se3.inverse(self.map.pose_of(other.keyframe_id))
-        p = se3.transform(T_p_o, other.p_c)
-        front = np.flatnonzero(p[:, 2] > 0)
-        nearest = painted.nearest(self.camera.project(p[front]))
-        found = nearest >= 0
-        mine, theirs = nearest[found], front[found]
-        z_mine = points.p_c[mine, 2]
-        same = np.abs(p[theirs, 2] - z_mine) < AGREE_DEPTH * z_mine
-        return np.unique(mine[same]), theirs[same]
+        T_p_w = self.map.pose_of(points.keyframe_id)
+        for other in others:
+            p = se3.transform(T_p_w @ self._T_w_c(other), other.p_c)
+            front = np.flatnonzero(p[:, 2] > 0)
+            nearest = painted.nearest(self.camera.project(p[front]))
+            found = nearest >= 0
+            mine, theirs = nearest[found], front[found]
+            z_mine = points.p_c[mine, 2]
+            same = np.abs(p[theirs, 2] - z_mine) < AGREE_DEPTH * z_mine
+            yield np.unique(mine[same]), theirs[same]
 
     def points(self, piece: int | None = None) -> PointCloud:
         """Edge points that several keyframes agree on, fused in cells, in the map's world frame.

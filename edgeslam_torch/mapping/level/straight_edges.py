@@ -20,8 +20,8 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.mapping.edges.edge_map import NEARLY, EdgePoints
 from edgeslam_torch.types import FloatArray, IntArray
 
-_MOST_KEYFRAMES, _MOST_SEGMENTS = 40, 800
-"""Maximum number of keyframes, spread evenly over the run, and of segments, the longest: half a second."""
+_MOST_KEYFRAMES, _MOST_SEGMENTS = 20, 800
+"""Maximum number of keyframes, spread evenly over the run, and of segments, the longest: a quarter of a second."""
 _LEAST_KEYFRAMES, _LEAST_SEGMENTS = 10, 40
 _MIN_LENGTH = 0.05
 """Minimum length of a segment relative to the image width."""
