@@ -16,7 +16,7 @@ PACKAGE = Path(module.__file__).parent
 COMPILED = sorted(
     path for path in PACKAGE.rglob("*.py") if "edgeslam_torch.compiled import compiled" in path.read_text("utf-8")
 )
-RHO = "from edgeslam_torch.optim.kernels.normal_equations import rho; print(rho(16.0, 1, 2.0))"
+RHO = "from edgeslam_torch.optim.kernels.normal_equations import rho; print(rho(16.0, 2.0))"
 
 
 def test_without_a_place_for_a_cache_every_process_compiles(monkeypatch):

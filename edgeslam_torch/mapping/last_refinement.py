@@ -1,6 +1,7 @@
 """Refinement of the whole map after the last keyframe, with edges and corners."""
 
 import logging
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,6 @@ import numpy as np
 from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.geometry.robust_statistics import Kernel
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.freed_depths import Weight
@@ -37,6 +37,7 @@ stiff modes never corrects (docs/decisions/12-solver.md)."""
 
 def lm_config(config: WindowConfig) -> LmConfig:
     """Solver settings of every refinement of the map."""
+    squares = {"delta": math.inf, "edge_delta": math.inf} if config.reprojection == "literal" else {}
     return LmConfig(
         solver=config.solver,
         diagnostics=False,
@@ -44,7 +45,7 @@ def lm_config(config: WindowConfig) -> LmConfig:
         mu=MU,
         cost_tolerance=COST_TOLERANCE,
         pose_tolerance=POSE_TOLERANCE,
-        kernel=Kernel.L2 if config.reprojection == "literal" else Kernel.HUBER,
+        **squares,
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95, Kernel
+from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.revisit import is_back
 from edgeslam_torch.map.slam_map import SlamMap
@@ -189,8 +189,8 @@ def window_problem(
 ) -> tuple[WindowProblem, list[IntArray]]:
     """A window's poses, anchors and observations, and the observations' keypoints of each keyframe.
 
-    Poses come free ones first, those of hosts outside the window last. With plain squares (``Kernel.L2``, the paper's
-    literal form) keypoints have equal weight; otherwise they are whitened by octave or alignment.
+    Poses come free ones first, those of hosts outside the window last. With plain squares (the paper's literal form,
+    an infinite ``delta``) keypoints have equal weight; otherwise they are whitened by octave or alignment.
     """
     keyframes = [*window.free, *window.fixed]
     row_of_anchor = np.full(len(slam_map.anchors.alive) + 1, -1, dtype=np.int64)
@@ -206,7 +206,6 @@ def window_problem(
     uv = np.concatenate([k.features.uv[s] for k, s in zip(keyframes, keypoint, strict=True)])
     octave = np.concatenate([k.features.octave[s] for k, s in zip(keyframes, keypoint, strict=True)])
     aligned = np.concatenate([k.aligned_px[s] for k, s in zip(keyframes, keypoint, strict=True)])
-    effective_samples = config.kernel is Kernel.L2
     growth = slam_map.scale_factor ** np.arange(slam_map.levels, dtype=np.float64)
     sigma_px = np.where(np.isnan(aligned), growth[octave], aligned)
     unsure = slam_map.anchors.from_depth[window.anchor]
@@ -226,7 +225,7 @@ def window_problem(
         obs_pose=np.concatenate(pose),
         obs_anchor=row,
         uv=uv.astype(np.float64),
-        inv_sigma=np.ones(len(row)) if effective_samples else 1.0 / sigma_px,
+        inv_sigma=np.ones(len(row)) if math.isinf(config.delta) else 1.0 / sigma_px,
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
         relative_priors=motions,
         scale_priors=() if extent is None else (extent,),

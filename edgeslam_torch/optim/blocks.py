@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.geometry.robust_statistics import Kernel
 from edgeslam_torch.optim.kernels import edges as edge_kernel
 from edgeslam_torch.optim.kernels.normal_equations import accumulate, coupled
 from edgeslam_torch.optim.problem import DepthPriors, EdgeTerms, JunctionTerms, LmConfig, Rows, WindowProblem
@@ -108,14 +107,13 @@ class Anchors:
         V, g_x, W = np.zeros((len(x), 3, 3)), np.zeros(x.shape), np.zeros((len(self.links.column), 3, 6))
         own = np.zeros((self.free, 6, 6))
         to = (V, g_x, own, g.reshape(-1, 6), W)
-        kernel = kernel_number(config.kernel), config.delta
         r, J, front = self.rows.reprojection(T_c_w, x, seen.pose, seen.anchor, self.uv, seen.inv_sigma, self.K)
         far = np.square(config.behind_px * seen.inv_sigma)
-        cost = accumulate(r, J, front, far, True, *kernel, seen.anchor, seen.column, self.slots[0], *to)
+        cost = accumulate(r, J, front, far, True, config.delta, seen.anchor, seen.column, self.slots[0], *to)
         if len(known.pose):
             r_known, J, f = self.rows.inverse_depth(T_c_w, x, known.pose, known.anchor, self.prior, known.inv_sigma)
             far = np.square(config.behind_px * known.inv_sigma)
-            cost += accumulate(r_known, J, f, far, True, *kernel, known.anchor, known.column, self.slots[1], *to)
+            cost += accumulate(r_known, J, f, far, True, config.delta, known.anchor, known.column, self.slots[1], *to)
         poses = np.arange(self.free)
         add_blocks(H, poses, poses, own)
         return Normal(V, g_x, W, cost, (r, front), self.order)
@@ -164,7 +162,7 @@ class Hosted:
             inverse_depth: ``(B, m)`` start.
             prior: Expected inverse depths ``(B, m)`` and their information ``(B, m, m)``.
             column: ``(W,)`` free-pose number of each pose, -1 for a fixed one.
-            config: Kernel and its width.
+            config: Width of the robust kernel.
 
         Raises:
             ValueError: If a pair's target is its host.
@@ -204,9 +202,8 @@ class Hosted:
         V = self.information.copy()
         pairs, views, m = len(self.pairs), len(T_j_i), x.shape[1]
         relative, own, g_view = np.zeros((pairs, m, 6)), np.zeros((views, 6, 6)), np.zeros((views, 6))
-        kernel = kernel_number(self.config.kernel), self.config.edge_delta
         to = (V, g_x, own, g_view, relative)
-        cost += accumulate(r, J, front, self.far, False, *kernel, self.block, self.view, self.pairs, *to)
+        cost += accumulate(r, J, front, self.far, False, self.config.edge_delta, self.block, self.view, self.pairs, *to)
         Ad = se3.adjoint(T_j_i)
         W = np.zeros((len(self.links.column), m, 6))
         coupled(relative, Ad, self.block, self.view, self.target_slot, self.host_slot, W)
@@ -299,11 +296,6 @@ def add_blocks(H: FloatArray, row: IntArray, column: IntArray, blocks: FloatArra
     """Add ``(n, 6, 6)`` to the poses' matrix ``(6 F, 6 F)`` at free poses ``(n,)``; fixed ones are -1."""
     F, free = len(H) // 6, (row >= 0) & (column >= 0)
     np.add.at(H.reshape(F, 6, F, 6).transpose(0, 2, 1, 3), (row[free], column[free]), blocks[free])
-
-
-def kernel_number(kernel: Kernel) -> int:
-    """Number of a robust kernel in `optim.kernels.normal_equations`."""
-    return list(Kernel).index(kernel)
 
 
 def _unsorted(values: NDArray[Value], order: IntArray) -> NDArray[Value]:

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.geometry.robust_statistics import CHI2_1DOF_95, CHI2_2DOF_95, Kernel
+from edgeslam_torch.geometry.robust_statistics import CHI2_1DOF_95, CHI2_2DOF_95
 from edgeslam_torch.types import FloatArray, IntArray
 
 
@@ -225,9 +225,8 @@ class LmConfig:
 
     max_iterations: int = 10
     """Maximum number of steps, accepted or not."""
-    kernel: Kernel = Kernel.HUBER
     delta: float = CHI2_2DOF_95**0.5
-    """Threshold of the robust kernel [standard deviations]."""
+    """Threshold of Huber's kernel [standard deviations]; infinite for plain squares."""
     edge_delta: float = CHI2_1DOF_95**0.5
     """The same for edge and junction rows, which are scalars."""
     mu: float = 1e-4

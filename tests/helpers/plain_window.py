@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from edgeslam_torch.geometry import se3_torch
-from edgeslam_torch.losses.robust import rho
+from edgeslam_torch.losses.robust import Kernel, rho
 from edgeslam_torch.optim.problem import LmConfig, WindowProblem
 
 
@@ -52,7 +52,7 @@ def dense(problem: WindowProblem, config: LmConfig) -> Dense:
         J = torch.cat([d.reshape(*r.shape, -1) for d in by], 2)
         value, weight = (r.square().sum(1), torch.ones(len(r)).double())
         if delta is not None:
-            value, weight = rho(value, config.kernel, delta)
+            value, weight = rho(value, Kernel.HUBER, delta)
         cost = cost + value.sum()
         H += torch.einsum("n,nki,nkj->ij", weight, J, J)
         g += torch.einsum("n,nki,nk->i", weight, J, r)

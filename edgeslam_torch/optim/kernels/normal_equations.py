@@ -16,25 +16,17 @@ from numpy.typing import NDArray
 from edgeslam_torch.compiled import compiled
 from edgeslam_torch.types import FloatArray, IntArray
 
-L2, HUBER, CAUCHY, TUKEY = range(4)
-"""Robust kernels, in the order of `losses.robust.Kernel`."""
 PIVOT = 1e-12
 """Pivot, relative to its diagonal entry, below which a direction is unobserved."""
 
 
 @compiled
-def rho(s: float, kernel: int, delta: float) -> tuple[float, float]:
-    """Robust cost of a squared residual and its derivative, the weight, as `losses.robust.rho`."""
-    c2 = delta * delta
-    if kernel == HUBER and s > c2:
-        outside = math.sqrt(s)
-        return c2 + 2.0 * delta * (outside - delta), delta / outside
-    if kernel == CAUCHY:
-        return c2 * math.log1p(s / c2), c2 / (c2 + s)
-    if kernel == TUKEY:
-        rest = max(1.0 - s / c2, 0.0)
-        return c2 / 3.0 * (1.0 - rest * rest * rest), rest * rest
-    return s, 1.0
+def rho(s: float, delta: float) -> tuple[float, float]:
+    """Huber's cost of a squared residual and its derivative, the weight, as `losses.robust.rho`."""
+    if s <= delta * delta:
+        return s, 1.0
+    outside = math.sqrt(s)
+    return delta * (2.0 * outside - delta), delta / outside
 
 
 @compiled
@@ -44,7 +36,6 @@ def accumulate(
     front: NDArray[np.bool_],
     far: FloatArray,
     joint: bool,
-    kernel: int,
     delta: float,
     block: IntArray,
     view: IntArray,
@@ -63,8 +54,7 @@ def accumulate(
         front: ``(n,)`` which lie in front of the camera.
         far: ``(n,)`` squared residual assigned behind the camera, and the largest with a non-zero weight.
         joint: Whether the k rows are one measurement with a common weight, or have one each.
-        kernel: Robust kernel.
-        delta: Its width.
+        delta: Width of Huber's kernel; infinite for plain squares.
         block: ``(n,)`` block of each residual.
         view: ``(n,)`` row of ``H`` and ``g_pose``; -1 for a fixed pose.
         slot: ``(n,)`` row of ``W``; not read where ``view`` is -1.
@@ -84,7 +74,7 @@ def accumulate(
             if joint and k + 1 < rows:
                 continue
             counts = front[e] and square < far[e]
-            value, weight = rho(square if counts else far[e], kernel, delta)
+            value, weight = rho(square if counts else far[e], delta)
             cost += value
             for i in range(0 if joint else k, k + 1):
                 weights[i] = weight if counts else 0.0
