@@ -282,8 +282,6 @@ class WindowConfig:
     ``off``."""
     adaptive: bool = True
     """Whiten edge and corner terms by the robust scales of their residuals (paper: "adaptive weighting")."""
-    rounds: int = 1
-    """Rounds of edge association and refinement."""
     edges_per_keyframe: int = 400
     """Edge pixels used per keyframe."""
     targets: int = 2
@@ -303,8 +301,7 @@ class WindowConfig:
     refinement, in the ``last`` one, or ``off``."""
 
     def __post_init__(self) -> None:
-        _positive(self, "rounds", "edges_per_keyframe", "targets", "in_flight_edges")
-        _at_most(self, rounds=100)
+        _positive(self, "edges_per_keyframe", "targets", "in_flight_edges")
         for loss in self.in_flight_losses:
             if loss not in _FLYING_FORMS:
                 raise ValueError(f"in_flight_losses must be among {', '.join(_FLYING_FORMS)}, got {loss!r}")

@@ -17,7 +17,7 @@ from edgeslam_torch.mapping.local_loop_closure import MAX_DRIFT_PX, reobserve_al
 from edgeslam_torch.mapping.motion_terms import ALIKE_AT_THE_END
 from edgeslam_torch.mapping.refinement import refine_all, whole_map, window_problem, write_back
 from edgeslam_torch.mapping.window_edges import WindowEdges
-from edgeslam_torch.optim.adaptive import AdaptiveScales, term_residuals, with_scales
+from edgeslam_torch.optim.adaptive import term_residuals, term_sigmas, with_scales
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, StopReason, WindowProblem, WindowResult
 
@@ -88,36 +88,26 @@ def refine_with_edges(
     config: WindowConfig,
     telemetry: TelemetryModel | None = None,
 ) -> WindowResult | None:
-    """Refine the whole map with edge and corner terms beside its anchors; edges are associated again in every round.
-
-    Returns:
-        Result of the last round; None if there was nothing to refine.
-    """
+    """Refine the whole map with edge and corner terms beside its anchors; None if there was nothing to refine."""
     freed = Weight.NONE if config.reprojection == "off" else Weight.EXACT
     window = whole_map(slam_map, freed, ALIKE_AT_THE_END)
     if window is None:
         return None
     keyframes = [*window.free, *window.fixed]
     terms = WindowEdges(edges, camera, config, flying=False)
-    scales = AdaptiveScales()
-    result = None
-    for _ in range(config.rounds):
-        problem, keypoint = window_problem(slam_map, window, camera, lm, telemetry)
-        placed = terms.place(problem, keyframes)
-        problem = placed.problem
-        if config.reprojection == "off":
-            problem = _without_points(problem)
-        if len(problem.obs_pose) == 0 and not placed.has_terms:
-            return result
-        if config.adaptive:
-            scales = scales.updated(term_residuals(problem))
-            problem = with_scales(problem, scales, EFFECTIVE_SAMPLES)
-            logger.debug("term scales %s", {k: round(t.sigma, 4) for k, t in scales.terms.items()})
-        result = refine_window(problem, lm)
-        if result.stop is StopReason.NOT_FINITE:
-            return result
-        if config.reprojection == "off":
-            keypoint = [k[:0] for k in keypoint]
+    problem, keypoint = window_problem(slam_map, window, camera, lm, telemetry)
+    placed = terms.place(problem, keyframes)
+    problem = placed.problem
+    if config.reprojection == "off":
+        problem, keypoint = _without_points(problem), [k[:0] for k in keypoint]
+    if len(problem.obs_pose) == 0 and not placed.has_terms:
+        return None
+    if config.adaptive:
+        sigmas = term_sigmas(term_residuals(problem))
+        problem = with_scales(problem, sigmas, EFFECTIVE_SAMPLES)
+        logger.debug("standard deviations of the terms: %s", sigmas)
+    result = refine_window(problem, lm)
+    if result.stop is not StopReason.NOT_FINITE:
         with slam_map.lock:  # a consistent snapshot for readers
             write_back(slam_map, window, keypoint, result)
             terms.write_back(keyframes, placed.edges, result.edge_inverse_depth)

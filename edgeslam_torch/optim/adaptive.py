@@ -4,7 +4,7 @@ The paper balances its terms by "adaptive weighting based on uncertainty" and gi
 whitened by a robust standard deviation of its own residuals, so that the weights of eq. (28) are pure numbers.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,57 +18,28 @@ SMALLEST_SIGMA = 1e-9
 """Minimum standard deviation of a term; smaller residuals are rounding errors."""
 
 
-@dataclass(frozen=True, slots=True)
-class TermScale:
-    """Running robust standard deviation of one term."""
-
-    sigma: float
-    """Current estimate, in the residual's unit."""
-    low: float
-    """Lower bound, so that no term dominates after a window with unusually small residuals."""
-    high: float
-    """Upper bound, so that a bad window does not disable a term."""
-    smoothing: float = 0.8
-    """Weight of the old value (in its logarithm) at each update."""
-    min_count: int = 30
-    """Minimum number of residuals for an update."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.low <= self.sigma <= self.high:
-            raise ValueError(f"need 0 < low <= sigma <= high, got {self.low}, {self.sigma}, {self.high}")
-        if not 0 <= self.smoothing < 1:
-            raise ValueError(f"smoothing must lie in [0, 1), got {self.smoothing}")
-
-    def updated(self, residual: FloatArray) -> "TermScale":
-        """The scale updated with one window's valid residuals."""
-        if residual.size < self.min_count:
-            return self
-        new = robust_sigma(residual)
-        if not new >= 0:
-            return self
-        new = min(max(new, self.low), self.high)
-        smooth = self.sigma**self.smoothing * new ** (1.0 - self.smoothing)
-        return replace(self, sigma=min(max(smooth, self.low), self.high))
+SCALES = {
+    "reproj": (1.0, 0.5, 3.0),
+    "edge": (1.0, 0.5, 3.0),
+    "cycle": (0.05, 0.01, 0.3),
+    "corner": (1.0, 0.5, 3.0),
+    "angle": (0.05, 0.01, 0.3),
+}
+"""Usual standard deviation of each term, and bounds, so that no window lets a term dominate or disables it."""
+USUAL = 0.8
+"""Weight of the usual standard deviation (in its logarithm) beside that of one map."""
+MIN_COUNT = 30
+"""Minimum number of residuals to measure a standard deviation."""
 
 
-@dataclass(frozen=True, slots=True)
-class AdaptiveScales:
-    """Scales of all terms of a window."""
-
-    terms: dict[str, TermScale] = field(
-        default_factory=lambda: {
-            "reproj": TermScale(1.0, 0.5, 3.0),
-            "edge": TermScale(1.0, 0.5, 3.0),
-            "cycle": TermScale(0.05, 0.01, 0.3),
-            "corner": TermScale(1.0, 0.5, 3.0),
-            "angle": TermScale(0.05, 0.01, 0.3),
-        }
-    )
-
-    def updated(self, residuals: dict[str, FloatArray]) -> "AdaptiveScales":
-        """Scales updated with one window; terms without residuals are unchanged."""
-        new = {k: s.updated(residuals[k]) if k in residuals else s for k, s in self.terms.items()}
-        return replace(self, terms=new)
+def term_sigmas(residuals: dict[str, FloatArray]) -> dict[str, float]:
+    """Standard deviation of every term from its valid residuals; the usual one without enough of them."""
+    sigmas = {}
+    for name, (usual, low, high) in SCALES.items():
+        found = residuals.get(name, np.zeros(0))
+        measured = robust_sigma(found) if found.size >= MIN_COUNT else usual
+        sigmas[name] = usual**USUAL * min(max(measured, low), high) ** (1.0 - USUAL)
+    return sigmas
 
 
 def term_residuals(problem: WindowProblem) -> dict[str, FloatArray]:
@@ -135,16 +106,15 @@ _LOSSES = {
 }
 
 
-def with_scales(problem: WindowProblem, scales: AdaptiveScales, alike: float = 1.0) -> WindowProblem:
-    """The window with its terms' standard deviations replaced by scales; terms that are off stay off.
+def with_scales(problem: WindowProblem, sigma: dict[str, float], alike: float = 1.0) -> WindowProblem:
+    """The window with its terms' standard deviations replaced; terms that are off stay off.
 
     Args:
         problem: A window.
-        scales: From `AdaptiveScales.updated` with `term_residuals`.
+        sigma: From `term_sigmas`.
         alike: Factor on the sigmas of edge terms: errors of neighbouring pixels on an edge are correlated, so
             ``alike**2`` of them count as one.
     """
-    sigma = {name: term.sigma for name, term in scales.terms.items()}
     problem = replace(problem, inv_sigma=problem.inv_sigma / sigma["reproj"])
     edges, junctions = problem.edges, problem.junctions
     if edges is not None:

@@ -127,7 +127,7 @@ def test_no_number_may_be_infinite_or_none(key):
 
 @pytest.mark.parametrize(
     "option",
-    ["orb.levels=21", "orb.candidates=2000000000", "flow.window_px=1000000", "flow.levels=99", "window.rounds=999"],
+    ["orb.levels=21", "orb.candidates=2000000000", "flow.window_px=1000000", "flow.levels=99"],
 )
 def test_what_costs_gigabytes_or_hours_is_refused(option):
     with pytest.raises(ConfigError, match="must be at most"):

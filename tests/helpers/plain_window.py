@@ -1,5 +1,6 @@
 """The window's normal equations for tests: plain residuals, automatic derivatives, one dense matrix."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -51,7 +52,7 @@ def dense(problem: WindowProblem, config: LmConfig) -> Dense:
         by = torch.func.jacfwd(residual, 0)(zero)
         J = torch.cat([d.reshape(*r.shape, -1) for d in by], 2)
         value, weight = (r.square().sum(1), torch.ones(len(r)).double())
-        if delta is not None:
+        if delta is not None and math.isfinite(delta):
             value, weight = rho(value, Kernel.HUBER, delta)
         cost = cost + value.sum()
         H += torch.einsum("n,nki,nkj->ij", weight, J, J)

@@ -23,7 +23,7 @@ from edgeslam_torch.slam import EdgeSlam
 POINTS = WindowConfig(alignment=False, cycle="off")
 FORMS = {
     "default": WindowConfig(),
-    "two rounds, corners": WindowConfig(angle="arms", collinearity="relative", rounds=2),
+    "corners": WindowConfig(angle="arms", collinearity="relative"),
     "fixed weights": WindowConfig(adaptive=False),
     "no alignment": WindowConfig(alignment=False),
     "no cycle": WindowConfig(cycle="off"),
@@ -124,7 +124,7 @@ def test_a_non_finite_anchor_skips_the_refinement_and_preserves_the_map():
 
 
 def test_the_last_refinement_uses_the_full_weight_of_telemetry(monkeypatch):
-    """In each of its rounds, with edges and without: thirty times, as in flight, bends what is straight."""
+    """Thirty times, as in flight, bends what is straight."""
     flight()
     asked = []
 

@@ -7,7 +7,7 @@ import pytest
 
 from edgeslam_torch.eval.benchmark.windows import Noise, WindowSize, seeded_window
 from edgeslam_torch.geometry.robust_statistics import robust_sigma
-from edgeslam_torch.optim.adaptive import AdaptiveScales, TermScale, term_residuals, with_scales
+from edgeslam_torch.optim.adaptive import SCALES, term_residuals, term_sigmas, with_scales
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig
 
@@ -41,11 +41,9 @@ def test_scaled_terms_have_unit_residuals_and_terms_that_are_off_stay_off():
     problem = at_truth(3, Noise(px=0.9, depth=0.1))
     edges = replace(problem.edges, pair_inv_sigma=np.full(len(problem.edges.pair_edge), 0.01))
     problem = replace(problem, edges=edges, junctions=replace(problem.junctions, inv_sigma_angle=0.0))
-    scales = AdaptiveScales()
-    for _ in range(40):  # to where the smoothing ends
-        scales = scales.updated(term_residuals(problem))
-    scaled = with_scales(problem, scales, alike=2.0)
     r = term_residuals(problem)
+    scales = term_sigmas(r) | {name: robust_sigma(found) for name, found in r.items()}
+    scaled = with_scales(problem, scales, alike=2.0)
     assert scaled.edges.pair_inv_sigma[0] * float(robust_sigma(r["edge"])) == pytest.approx(0.5, rel=0.02)
     assert scaled.edges.cycle_sigma == pytest.approx(2.0 * float(robust_sigma(r["cycle"])), rel=0.02)
     assert scaled.junctions.inv_sigma_angle == 0.0
@@ -61,7 +59,6 @@ def test_a_wrong_sigma_is_corrected_and_improves_the_poses():
     edges = window.problem.edges
     # Edges stated far too poor (20 px), as a constant weight may be in another scene.
     problem = replace(window.problem, edges=replace(edges, pair_inv_sigma=np.full(len(edges.pair_edge), 0.05)))
-    scales = AdaptiveScales()
     errors = []
     for adaptive in (False, True):
         solved = refine_window(problem, LmConfig(max_iterations=30))
@@ -72,9 +69,7 @@ def test_a_wrong_sigma_is_corrected_and_improves_the_poses():
                 p_w=solved.p_w,
                 edges=replace(problem.edges, inverse_depth=solved.edge_inverse_depth),
             )
-            for _ in range(10):
-                scales = scales.updated(term_residuals(now))
-            solved = refine_window(with_scales(now, scales), LmConfig(max_iterations=30))
+            solved = refine_window(with_scales(now, term_sigmas(term_residuals(now))), LmConfig(max_iterations=30))
         errors.append(np.abs(solved.T_c_w - window.T_c_w).max())
     assert errors[1] < 0.9 * errors[0]
 
@@ -85,23 +80,14 @@ def test_the_papers_pixel_cycle_is_measured_in_pixels():
     found = term_residuals(pixel)
     assert "cycle" not in found
     assert len(found["cycle px"]) > 1000
-    scaled = with_scales(pixel, AdaptiveScales())
-    assert scaled.edges.cycle_sigma == AdaptiveScales().terms["edge"].sigma
+    assert with_scales(pixel, term_sigmas({})).edges.cycle_sigma == pytest.approx(SCALES["edge"][0])
 
 
-def test_scale_is_smooth_clamped_and_unmoved_by_few():
-    scale = TermScale(1.0, 0.5, 2.0)
-    few, wild = np.full(10, 9.0), np.full(100, 50.0)
-    assert scale.updated(few) == scale
-    once = scale.updated(wild)
-    assert 1.0 < once.sigma < 2.0
-    for _ in range(50):
-        once = once.updated(wild)
-    assert once.sigma == pytest.approx(2.0, rel=1e-4)
-    assert AdaptiveScales().updated({"edge": wild}).terms["reproj"] == AdaptiveScales().terms["reproj"]
-
-
-@pytest.mark.parametrize("low, sigma, high", [(0.0, 1.0, 2.0), (1.0, 0.5, 2.0), (1.0, 3.0, 2.0)])
-def test_scale_rejects_an_invalid_range(low, sigma, high):
-    with pytest.raises(ValueError, match="low <= sigma"):
-        TermScale(sigma, low, high)
+def test_a_scale_is_drawn_to_its_usual_value_clamped_and_unmoved_by_few():
+    usual = term_sigmas({})
+    assert usual == pytest.approx({name: scale[0] for name, scale in SCALES.items()})
+    assert term_sigmas({"edge": np.full(10, 9.0)}) == usual
+    wild = term_sigmas({"edge": np.full(100, 50.0)})
+    assert usual["edge"] < wild["edge"] < SCALES["edge"][2]
+    assert wild == term_sigmas({"edge": np.full(100, 500.0)})
+    assert wild["reproj"] == usual["reproj"]
