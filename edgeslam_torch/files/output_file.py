@@ -6,11 +6,18 @@ whatever name or hard link it is given. Folders of runs have a rule of their own
 
 import argparse
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from edgeslam_torch.errors import OutputError
+
+_PARTS = re.compile(
+    r"trajectory.*\.txt|status\.csv|summary\.json|(edge_map|anchors)\.ply|observations\.npz"
+    r"|(rgb|depth|times|groundtruth|accelerometer)\.txt|(telemetry|imu|data)\.csv|(imu|sensor|metadata)\.yaml"
+)
+"""Names of the files that runs and recordings consist of."""
 
 STDOUT = Path("-")
 """Printed, where a command offers it."""
@@ -51,9 +58,19 @@ def check_outputs(parser: argparse.ArgumentParser, args: argparse.Namespace) -> 
         if any(_same(path, other) for other in named):
             raise OutputError(f"{path}: given twice; give another file to {option}")
         named.append(path)
-        if any(_same(path, other) for other in read):
-            raise OutputError(f"{path}: is what the command reads; give another file to {option}")
+        check_not_read(path, read, option)
         check_new(path, args.overwrite, option)
+
+
+def check_not_read(path: Path, read: Iterable[str | Path], option: str) -> None:
+    """Check that a file to write is none of those read, and no part of a run or recording among them.
+
+    Raises:
+        OutputError: If it is.
+    """
+    is_part = _PARTS.fullmatch(path.name) is not None and path.exists()
+    if any(_same(path, other) or (is_part and _same(path.parent, other)) for other in read):
+        raise OutputError(f"{path}: is what the command reads; give another file to {option}")
 
 
 def check_new(path: Path, overwrite: bool, option: str = "--out") -> None:

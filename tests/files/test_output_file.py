@@ -2,6 +2,7 @@
 
 import argparse
 import os
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from edgeslam_torch.cli import main
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.output_file import add_overwrite, check_new, check_outputs, output_file
+from edgeslam_torch.writers.run_writer import OUTPUTS
 
 
 @pytest.fixture
@@ -23,6 +25,14 @@ def parser() -> argparse.ArgumentParser:
 
 def _check(parser: argparse.ArgumentParser, *words: object) -> None:
     check_outputs(parser, parser.parse_args([str(word) for word in words]))
+
+
+@pytest.mark.parametrize("name", [*OUTPUTS, "rgb.txt", "groundtruth.txt", "telemetry.csv", "mine.json"])
+def test_no_file_of_a_folder_that_is_read_is_replaced(parser, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    free = {"mine.json", "report.html", "map.png", "config.toml", "camera.yaml"}  # not read, or what calibrate makes
+    with nullcontext() if name in free else pytest.raises(OutputError, match="reads"):
+        _check(parser, tmp_path, "--json", tmp_path / name, "--overwrite")
 
 
 @pytest.mark.parametrize("spelling", ["same", "relative", "symlink", "hard link"])
@@ -59,6 +69,7 @@ def test_a_folder_is_no_file(tmp_path: Path) -> None:
         "eval IN -g IN --markdown FILE",
         "eval IN -g IN --json FILE --overwrite",
         "eval IN -g IN --convert tum FILE",
+        "eval IN -g IN --convert tum FILE --overwrite",
         "compare IN IN -g IN --json FILE",
         "calibrate IN --out FILE",
         "export --out FILE",

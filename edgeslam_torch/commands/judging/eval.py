@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from edgeslam_torch.errors import ConfigError, EdgeSlamError, OutputError
 from edgeslam_torch.extras import needs_extra
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.files.output_file import add_overwrite_to, check_new, output_file
+from edgeslam_torch.files.output_file import add_overwrite_to, check_new, check_not_read, output_file
 
 if TYPE_CHECKING:
     from edgeslam_torch.eval.metrics.common_frames import CommonScore
@@ -201,6 +201,7 @@ def _write_files(args: argparse.Namespace, scores: "list[RunScore]", judged: lis
         if not trajectory.oriented:
             raise OutputError(f"{trajectory.source}: positions alone, and {name} has orientations: not converted")
         for path in _conversion(name, Path(target)):
+            check_not_read(path, (read for pair in judged for read in pair), "--convert")
             check_new(path, args.overwrite, "--convert")
         WRITERS[name](trajectory, target)
 
