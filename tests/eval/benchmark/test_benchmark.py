@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.commands.judging import bench
-from edgeslam_torch.eval.benchmark.benchmark import BenchSettings, markdown_bench, sequences
+from edgeslam_torch.eval.benchmark.benchmark import BenchSettings, figures_of, markdown_bench, sequences
 from edgeslam_torch.eval.benchmark.compare import compare, markdown_compare, read_record
 from edgeslam_torch.eval.benchmark.machine_speed import CpuTimes, disturbance, read_cpu_times
 from edgeslam_torch.eval.benchmark.probes import gather
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.metrics.run_score import evaluate_run
 
 
 def record(ate: list[float], cpu: list[float]) -> dict[str, Any]:
@@ -70,6 +71,13 @@ def test_what_is_not_the_whole_sequence_is_said() -> None:
     text = markdown_bench(record([0.01], [30]) | {"max_frames": 80, "took_s": 90.0})
     assert "only the first 80 frames" in text and "1.5 minutes" in text
     assert "| DROID-SLAM, tum_fr1 (average of 9) [" in text
+
+
+def test_figures_are_plain_numbers(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    truth = run_folder(tmp_path / "a")
+    found = figures_of(evaluate_run(tmp_path / "a", truth))
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert found["ate_sim3_m"] is not None and found["cpu_ms_per_frame"] == 33.1
 
 
 def timed_record(rng: np.random.Generator, speed: float, scatter: float, factor: float = 1.0) -> dict[str, Any]:

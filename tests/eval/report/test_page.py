@@ -90,6 +90,12 @@ def test_no_reason_or_setting_breaks_the_page(run: Path) -> None:
         assert page.data["events"][0][4] == name
 
 
+def test_a_large_map_is_shown_by_a_part_of_its_points(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = len(Page(write_report(run)).text["edges-data"])
+    monkeypatch.setattr("edgeslam_torch.eval.report.page.MAX_POINTS", 40)  # of 100
+    assert len(Page(write_report(run)).text["edges-data"]) == pytest.approx(0.4 * whole, rel=0.02)
+
+
 def test_pieces_are_named_with_their_seconds(run: Path) -> None:
     spans = ((0.0, 8.133333), (8.166667, 11.466667))
     pieces = [{"number": k, "supported": 5, "first_s": a, "last_s": b} for k, (a, b) in enumerate(spans)]
