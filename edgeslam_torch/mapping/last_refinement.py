@@ -13,9 +13,8 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.freed_depths import Weight
 from edgeslam_torch.mapping.fuse import fuse_all
-from edgeslam_torch.mapping.local_loop_closure import MAX_DRIFT_PX, reobserve_all
 from edgeslam_torch.mapping.motion_terms import ALIKE_AT_THE_END
-from edgeslam_torch.mapping.refinement import refine_all, whole_map, window_problem, write_back
+from edgeslam_torch.mapping.refinement import whole_map, window_problem, write_back
 from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.adaptive import term_residuals, term_sigmas, with_scales
 from edgeslam_torch.optim.local_ba import refine_window
@@ -64,31 +63,15 @@ def last_refinement(
         telemetry: Adds displacements, heights and gravity; None for none.
 
     Returns:
-        Result of the last solver run; None if there was nothing to refine.
+        The solver's result; None if there was nothing to refine.
     """
-    lm = replace(lm_config(config), max_iterations=ITERATIONS)
+    lm = replace(lm_config(config), max_iterations=ITERATIONS, losses=True)
     if config.reprojection != "off":
-        with slam_map.lock:
-            drift_px = max(reobserve_all(slam_map, camera), default=0.0)
-        if drift_px > MAX_DRIFT_PX:
-            refine_all(slam_map, camera, lm, telemetry, Weight.EXACT, ALIKE_AT_THE_END)
         with slam_map.lock:
             fuse_all(slam_map, camera)
     edges.update(everything=True)
     with slam_map.lock:
         edges.follow_anchors()
-    return refine_with_edges(slam_map, camera, edges, replace(lm, losses=True), config, telemetry)
-
-
-def refine_with_edges(
-    slam_map: SlamMap,
-    camera: Camera,
-    edges: EdgeMap,
-    lm: LmConfig,
-    config: WindowConfig,
-    telemetry: TelemetryModel | None = None,
-) -> WindowResult | None:
-    """Refine the whole map with edge and corner terms beside its anchors; None if there was nothing to refine."""
     freed = Weight.NONE if config.reprojection == "off" else Weight.EXACT
     window = whole_map(slam_map, freed, ALIKE_AT_THE_END)
     if window is None:

@@ -37,12 +37,6 @@ MIN_SHARED = 15
 """Number of shared anchors from which on two keyframes are covisible, as in `SlamMap.covisible`."""
 
 
-def reobserve_all(slam_map: SlamMap, camera: Camera) -> list[float]:
-    """`reobserve` for every keyframe; returns the drift [px] of the rejoined ones."""
-    drifts = [reobserve(slam_map, camera, keyframe) for keyframe in list(slam_map.keyframes.values())]
-    return [d for d in drifts if d is not None]
-
-
 def revisit_candidate(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
     """Revisit candidate: the older keyframe nearest in position and direction that shares few anchors with this one,
     or None."""

@@ -113,11 +113,9 @@ def refine_all(
     camera: Camera,
     config: LmConfig,
     telemetry: TelemetryModel | None = None,
-    freed: Weight = Weight.NONE,
-    effective_samples: float = EFFECTIVE_SAMPLES,
 ) -> WindowResult | None:
     """Refine every keyframe of the map jointly; None if there is nothing to refine, see `whole_map`."""
-    window = whole_map(slam_map, freed, effective_samples)
+    window = whole_map(slam_map)
     return None if window is None else refine(slam_map, window, camera, config, telemetry)
 
 

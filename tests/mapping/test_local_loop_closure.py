@@ -9,7 +9,7 @@ from point_map import CAMERA, PointMap, check_map, small_motion
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.local_loop_closure import reobserve, reobserve_all, revisit_candidate
+from edgeslam_torch.mapping.local_loop_closure import reobserve, revisit_candidate
 from edgeslam_torch.mapping.refinement import refine_all
 from edgeslam_torch.optim.problem import LmConfig
 
@@ -68,7 +68,8 @@ def test_a_returning_camera_is_matched_and_the_drift_corrected(rng, drift):
     assert before - len(points.map.anchors) > 50
     for _ in range(2):
         refine_all(points.map, CAMERA, LmConfig(max_iterations=50, cost_tolerance=1e-9, diagnostics=False))
-        reobserve_all(points.map, CAMERA)
+        for keyframe in points.keyframes:
+            reobserve(points.map, CAMERA, keyframe)
     check_map(points.map)
     apart = se3.log(last.T_c_w @ se3.inverse(points.keyframes[1].T_c_w))
     assert np.abs(apart).max() < 0.1 * np.abs(se3.log(drift)).max()
@@ -86,7 +87,7 @@ def test_covisible_keyframes_are_skipped(rng):
     points = PointMap(rng, 300, 4)
     points.fill()
     assert revisit_candidate(points.map, points.keyframes[0]) is None, "none is older"
-    assert reobserve_all(points.map, CAMERA) == []
+    assert all(reobserve(points.map, CAMERA, keyframe) is None for keyframe in points.keyframes)
     check_map(points.map)
 
 
