@@ -9,9 +9,8 @@ import numpy as np
 
 from edgeslam_torch.navigation.contact.losses import Losses
 from edgeslam_torch.navigation.drone_state import DroneState
-from edgeslam_torch.navigation.exploring.around import LooksAround
 from edgeslam_torch.navigation.exploring.frontiers import WIDE_M, Looks, frontiers, reachable
-from edgeslam_torch.navigation.exploring.second_look import SecondLook
+from edgeslam_torch.navigation.exploring.view_planner import ViewPlanner
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
 from edgeslam_torch.navigation.supervisor import DEAD_RECKONING_SIGMA_M
@@ -122,30 +121,17 @@ class Explore:
     until_s: float = np.inf
     """On the clock of the states."""
     _looks: Looks = field(default_factory=Looks)
-    _around: LooksAround = field(default_factory=LooksAround)
-    _second: SecondLook = field(default_factory=SecondLook)
+    _views: ViewPlanner = field(default_factory=ViewPlanner)
 
     def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """Goal cells in order of priority: viewpoints of candidate openings near the path; wide frontiers, viewpoints
-        of uncovered borders and of other candidates; narrow frontiers and candidates that are still unconfirmed.
-        """
-        here = state.p_w[:2]
-        borders = self._looks.worth(reachable(frontiers(layer), layer, here), layer, state)
-        if len(found := self._second.on_the_way(layer, state)):
-            return self._goes_on(found)
+        """Viewpoints of undecided openings near the path; else these and wide frontiers and viewpoints of uncovered
+        borders; else narrow frontiers. Exploration is not over while there are any."""
+        borders = self._looks.worth(reachable(frontiers(layer), layer, state.p_w[:2]), layer, state)
         wide = (borders[:, None] == frontiers(layer, WIDE_M)).all(-1).any(1)
-        found = np.concatenate([borders[wide], self._around.goals(layer, state), self._second.goals(layer, state)])
+        found = self._views.goals(layer, state, borders[wide])
         if len(found):
-            return self._goes_on(found)
-        self._second.once_more(state)
-        again = self._second.goals(layer, state)
-        return np.concatenate([borders, self._goes_on(again)])
-
-    def _goes_on(self, cells: np.ndarray) -> np.ndarray:
-        """Pass cells on; exploration is not over while there are any."""
-        if len(cells):
             self._looks.go_on()
-        return cells
+        return found if len(found) else borders
 
     def done(self, state: DroneState) -> bool:
         """Whether the time is over or nothing is left to explore."""
@@ -157,12 +143,11 @@ class Explore:
 
     def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
         """Receive candidate openings."""
-        self._second.consider(candidates)
+        self._views.consider(candidates)
 
     def heading_rad(self, state: DroneState) -> float | None:
-        """Heading to an uncovered border or a candidate opening visible from here."""
-        around = self._around.heading_rad(state)
-        return around if around is not None else self._second.heading_rad(state)
+        """Heading to an undecided opening or an uncovered border visible from here."""
+        return self._views.heading_rad(state)
 
     def faces_rad(self, state: DroneState) -> float | None:
         """None: ahead."""

@@ -120,7 +120,7 @@ def test_narrow_space_ahead_is_entered_unless_it_is_a_door():
     ahead, to_the_left = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     for middle, normal, far in ((1.8, ahead, False), (1.8, to_the_left, True), (-3.0, ahead, True)):
         task = FollowCorridor()
-        task.consider([Candidate(np.array([middle, 0.2]), normal, np.array([0.0, 0.0]))])
+        task.consider([Candidate(np.array([middle, 0.2]), normal, np.zeros((0, 2)))])
         last = follow(task, narrow, *[(x, 0.0) for x in (-1.0, -0.5, 0.0, 0.5)], (1.0, 0.0))
         assert bool(last[0] > 4.0) is far
     task, wide = FollowCorridor(), np.array([1.8, 0.2, 1.15])
@@ -237,7 +237,7 @@ def test_narrowed_mouth_is_entered_unless_it_is_a_door():
     """The mouth is two metres wide, and one metre on the map."""
     layer = seen(lambda x, y: stub(x, y) | (np.abs(x) > 0.5) & (y > 0.8))
     door = Exit(np.array([0.0, 1.0, 1.15]), np.array([0.0, 1.0, 0.0]), 1.0, 0.1, 0.1, 2)
-    may_be = Candidate(door.centre_w[:2], door.normal_w[:2], np.array([-1.0, 0.0]))
+    may_be = Candidate(door.centre_w[:2], door.normal_w[:2], np.zeros((0, 2)))
     for candidates, exits, flies in (([], [], True), ([may_be], [], True), ([], [door], False)):
         task = FollowCorridor()
         task.consider(candidates, exits)

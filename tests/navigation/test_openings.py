@@ -148,7 +148,7 @@ def test_one_viewpoint_makes_a_candidate_two_an_exit():
     (candidate,) = watched([0.0] * 8, walls).candidates
     assert candidate.centre_w == pytest.approx([2.0, 0.0], abs=0.12)
     assert abs(candidate.normal_w[0]) == pytest.approx(1.0, abs=0.05)
-    assert candidate.place_w == pytest.approx([0.0, 0.0])
+    assert candidate.told_w == pytest.approx(np.zeros((1, 2)))
     assert watched([0.0, 0.1, 0.2, 0.6], walls).candidates == ()
     assert watched([0.0] * 8, surroundings(PILLARS)).candidates == (), "what can be passed by"
 

@@ -82,11 +82,9 @@ class Candidate:
     centre_w: FloatArray
     """``(2,)`` [m]."""
     normal_w: FloatArray
-    """``(2,)`` unit normal."""
-    place_w: FloatArray
-    """``(2,)`` first viewpoint [m]."""
-    elsewhere: bool = True
-    """Whether the first viewpoint has told all it can."""
+    """``(2,)`` unit normal, away from the first viewpoint."""
+    told_w: FloatArray
+    """``(N, 2)`` viewpoints whose views have told all they can [m]."""
 
 
 class _Track:
@@ -161,9 +159,9 @@ class _Track:
         return sum(log_odds > 0.0 for log_odds in self._evidence)
 
     @property
-    def is_told(self) -> bool:
-        """Whether the first viewpoint has told all it can, and no other one anything."""
-        return self._evidence[0] == _VIEWPOINT and not any(self._evidence[1:])
+    def told_w(self) -> FloatArray:
+        """``(N, 2)`` viewpoints whose views have told all they can."""
+        return self.viewpoints.p_w[np.abs(self._evidence) >= _VIEWPOINT]
 
 
 @dataclass(slots=True)
@@ -205,8 +203,8 @@ class ExitTracker:
 
     def _conclude(self, layer: Layer, state: DroneState) -> None:
         """Exits and candidates by odds and geometry."""
-        found = []
-        undecided = []
+        found: list[Exit] = []
+        undecided: list[Candidate] = []
         for track in sorted(self._tracks, key=lambda t: -t.odds):
             if track.odds < _UNDECIDED or track.width_m > WIDEST_M:
                 continue
@@ -217,7 +215,7 @@ class ExitTracker:
                 if track.parts > 0.0 and not any(_one_passage(_exit(track, state), other) for other in found):
                     found.append(_exit(track, state))
             elif not round_:
-                undecided.append(Candidate(track.centre_w, track.normal_w, track.viewpoints.p_w[0], track.is_told))
+                undecided.append(Candidate(track.centre_w, track.normal_w, track.told_w))
         self.exits = tuple(sorted(found, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - state.p_w[:2]))))
         self.candidates = tuple(undecided)
 
