@@ -1,16 +1,13 @@
 """Tasks of a flight beside those of `navigation.tasks`: hover, and return home."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
-from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
 from edgeslam_torch.navigation.tasks import LooksAhead
 from edgeslam_torch.types import FloatArray
 
@@ -44,7 +41,7 @@ class Stay(LooksAhead):
 
 
 @dataclass(slots=True)
-class WayHome:
+class WayHome(LooksAhead):
     """Fly to the take-off; along the path flown while the take-off lies beyond the grid.
 
     On the way back the camera faces the opposite direction and revisits nothing, so the map drifts by about 2 % of the
@@ -82,9 +79,6 @@ class WayHome:
         """Never: there is no alternative."""
         return False
 
-    def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
-        """Ignore openings."""
-
     def heading_rad(self, state: DroneState) -> float | None:
         """The heading of the take-off, 0, for `_LOOK_S` near the take-off."""
         away = float(np.linalg.norm(state.p_w[:2]))
@@ -94,7 +88,7 @@ class WayHome:
             return None
         if math.isnan(self._near_s):
             self._near_s = state.stamp_s
-        if math.isnan(self._looks_s) and abs(float(wrapped(np.array(state.yaw_rad)))) < _AHEAD_RAD:
+        if math.isnan(self._looks_s) and abs(state.turn_to_rad(0.0)) < _AHEAD_RAD:
             self._looks_s = state.stamp_s
         if state.stamp_s - self._looks_s > _LOOK_S or state.stamp_s - self._near_s > _GIVEN_UP_S:
             self._looked_s = state.stamp_s

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.map_views import MapUpdate, MapViews
 from edgeslam_torch.types import FloatArray
 
@@ -73,6 +74,10 @@ class DroneState:
     def home_sigma_m(self) -> float:
         """Standard deviation of the position relative to the take-off [m], without scale uncertainty."""
         return math.hypot(self.position_sigma_m, self.submap_sigma_m, self.drift_sigma_m)
+
+    def turn_to_rad(self, heading_rad: float) -> float:
+        """Turn to the left to a heading, in [-pi, pi)."""
+        return float(wrapped(np.array(heading_rad - self.yaw_rad)))
 
     @property
     def blind_s(self) -> float:

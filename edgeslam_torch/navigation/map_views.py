@@ -150,9 +150,14 @@ class Places:
         """Drop all others."""
         self._view, self._local = self._view[some], self._local[some]
 
+    def away_m(self, p_w: FloatArray) -> FloatArray:
+        """Distance [m] of points ``(..., size)`` from the nearest of them; infinite without any."""
+        away = np.linalg.norm(np.asarray(p_w)[..., None, :] - self.p_w, axis=-1)
+        return np.asarray(away.min(axis=-1, initial=np.inf))
+
     def is_near(self, p_w: FloatArray, away_m: float) -> bool:
         """Whether any of them is less than ``away_m`` from a point ``(size,)``."""
-        return bool((np.linalg.norm(self.p_w - p_w, axis=1) < away_m).any())
+        return bool(self.away_m(p_w) < away_m)
 
 
 def moves(before_w: FloatArray, after_w: FloatArray, least_m: float) -> bool:

@@ -243,7 +243,7 @@ class Pilot:
             self._sweep = [state.yaw_rad + side * _SWEEP_RAD for side in (0.0, 1.0, -1.0)]
         if self.phase is Phase.SWEEPING:
             self._sweep = self._worth_a_look(state)
-            error = float(wrapped(np.array(self._sweep[-1] - state.yaw_rad)))
+            error = state.turn_to_rad(self._sweep[-1])
             if abs(error) < math.radians(8.0):
                 self._sweep.pop()
             if self._sweep:
@@ -278,10 +278,7 @@ class Pilot:
         heading = self.task.heading_rad(state)
         if heading is not None:
             self._progress_s = state.stamp_s
-            return VelocityCommand(
-                turn_left_rad_s=self._turn(float(wrapped(np.array(heading - state.yaw_rad)))),
-                why="hover and look",
-            )
+            return VelocityCommand(turn_left_rad_s=self._turn(state.turn_to_rad(heading)), why="hover and look")
         plan = self._planned(state)
         here = state.p_w[:2]
         now = float(plan.at(here))
@@ -305,7 +302,7 @@ class Pilot:
             return VelocityCommand(turn_left_rad_s=self._search(state), why="no path: look around")
         self.way_w = plan.way(here, 3.0)
         ahead, faced = self._bearing(here), self.task.faces_rad(state)
-        error = float(wrapped(np.array((ahead if faced is None else faced) - state.yaw_rad)))
+        error = state.turn_to_rad(ahead if faced is None else faced)
         turn = self._turn(error)
         chosen = self._chosen(state, plan, ahead, error)
         if chosen is None:
@@ -334,7 +331,7 @@ class Pilot:
         step = self._plan.layer.centres(self._goals).mean(axis=0) - state.p_w[:2]
         side = 4.0 * abs(state.stamp_s / _SEARCH_S % 1.0 - 0.5) - 1.0
         wanted = math.atan2(step[1], step[0]) + side * _SEARCH_RAD
-        return self._turn(float(wrapped(np.array(wanted - state.yaw_rad))))
+        return self._turn(state.turn_to_rad(wanted))
 
     def _planned(self, state: DroneState) -> CostToGo:
         """The plan, updated every `_REPLAN_S`."""

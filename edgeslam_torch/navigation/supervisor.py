@@ -10,7 +10,6 @@ from enum import StrEnum
 
 import numpy as np
 
-from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.contact.push import PUSHED_M_S, Push
 from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.limits import NavLimits
@@ -290,7 +289,7 @@ class Supervisor:
             return 0.0
         moment = self._headings[-1][0] - before_s
         yaw = next(h for at, h in self._headings if at >= moment)
-        error = float(wrapped(np.array(yaw - self._state.yaw_rad)))
+        error = self._state.turn_to_rad(yaw)
         return float(np.clip(2.0 * error, -self.limits.turn_rad_s, self.limits.turn_rad_s))
 
     def _back(self, danger: Danger, trouble_s: float) -> VelocityCommand:

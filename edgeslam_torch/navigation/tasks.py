@@ -111,7 +111,7 @@ def _doubt_m(state: DroneState) -> float:
 
 
 @dataclass(slots=True)
-class Explore:
+class Explore(LooksAhead):
     """Frontier exploration with looks to the sides, until no frontier is left or the time is over.
 
     A camera with a 55 degree field of view does not see the wall that the drone comes through, hence the looks to the
@@ -148,7 +148,3 @@ class Explore:
     def heading_rad(self, state: DroneState) -> float | None:
         """Heading to an undecided opening or an uncovered border visible from here."""
         return self._views.heading_rad(state)
-
-    def faces_rad(self, state: DroneState) -> float | None:
-        """None: ahead."""
-        return None

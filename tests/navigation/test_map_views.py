@@ -83,3 +83,17 @@ def test_moves_below_a_cell_are_ignored():
     assert moves(BEFORE, shifted, 0.1)
     shifted[0, 0, 3] -= 0.05
     assert not moves(BEFORE, shifted, 0.1)
+
+
+def test_points_estimated_anew_stay_tied_to_their_views():
+    views = MapViews()
+    views.add(3, np.eye(4))
+    places = Places(views, [[2.0, 0.0]])
+    views.add(4, np.eye(4))
+    places.move(np.array([[2.2, 0.0]]))
+    to = np.eye(4)
+    to[1, 3] = 1.0
+    views.correct(moved(3, to))
+    assert places.p_w.tolist() == [[2.2, 1.0]]
+    assert places.away_m(np.array([[2.2, 0.0], [5.2, 5.0]])).tolist() == [1.0, 5.0]
+    assert Places().away_m(np.zeros(2)) == np.inf

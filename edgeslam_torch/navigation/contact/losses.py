@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.map_views import Places
 
@@ -30,6 +28,6 @@ class Losses:
         elif state.overridden and not self._lost:
             self._lost = True
             here = state.p_w[:2]
-            if len(self._place) == 0 or float(np.linalg.norm(here - self._place.last_w)) > self.about_m:
+            if float(self._place.away_m(here)) > self.about_m:
                 self._place, self.count = Places(state.views, [here]), 0
             self.count += 1

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.corridor.corridor_geometry import unknown_sides
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
@@ -94,7 +93,7 @@ class DeadEndScan:
         if not state.tracked:
             self._headings = []
             return None
-        if abs(float(wrapped(np.array(self._headings[-1] - state.yaw_rad)))) > _THERE_RAD:
+        if abs(state.turn_to_rad(self._headings[-1])) > _THERE_RAD:
             self._reached_s = state.stamp_s
         elif state.stamp_s - self._reached_s > _STANDS_S:
             self._headings.pop()

@@ -76,14 +76,14 @@ class Trail:
 
     def leads_on(self, p_w: FloatArray) -> np.ndarray:
         """Which of the points ``(N, 2)`` are in no dead end."""
-        return _apart(p_w, self._dead_ends.p_w, _DEAD_END_M)
+        return np.asarray(self._dead_ends.away_m(p_w) > _DEAD_END_M)
 
     def turns_off(self, p_w: FloatArray, here_w: FloatArray) -> np.ndarray:
         """Which of the points ``(N, 2)`` lie neither in the corridor flown up to here nor behind its start."""
-        places_w = self.places_w
-        step = p_w - places_w[0]
+        step = p_w - self.places_w[0]
         behind = (step @ self.began_w < 0.0) & (np.abs(aside(step, self.began_w)) < PASSED_M)
-        return _apart(p_w, np.concatenate([places_w, here_w[None]]), PASSED_M) & ~behind
+        flown = np.minimum(self._places.away_m(p_w), np.linalg.norm(p_w - here_w, axis=1)) <= PASSED_M
+        return np.asarray(~flown & ~behind)
 
 
 def aside(step: FloatArray, axis: FloatArray) -> FloatArray:
@@ -94,8 +94,3 @@ def aside(step: FloatArray, axis: FloatArray) -> FloatArray:
         array(0.5)
     """
     return np.asarray(step[..., 1] * axis[0] - step[..., 0] * axis[1])
-
-
-def _apart(p_w: FloatArray, places_w: FloatArray, away_m: float) -> np.ndarray:
-    """Which of the points ``(N, 2)`` are farther than ``away_m`` from all places ``(M, 2)``."""
-    return np.asarray((np.linalg.norm(p_w[:, None] - places_w, axis=2) > away_m).all(axis=1))

@@ -115,14 +115,14 @@ class ViewPlanner:
             self._since_s = state.stamp_s
         if not state.tracked or state.stamp_s - self._since_s > _GIVEN_UP_S:
             self._headings = []
-        while self._headings and abs(float(wrapped(np.array(self._headings[-1] - state.yaw_rad)))) < _THERE_RAD:
+        while self._headings and abs(state.turn_to_rad(self._headings[-1])) < _THERE_RAD:
             self._headings.pop()
         return self._headings[-1] if self._headings else None
 
     def _tells(self, p_w: FloatArray, inside_m: float = 0.0) -> np.ndarray:
         """``(P,)`` whether a view from points ``(P, 2)`` would tell about an opening."""
         told = [_tells(opening, p_w, inside_m) for opening in self._openings]
-        return np.any(told, axis=0) & (_away_m(p_w, self._spent) > _AGAIN_M) if told else np.zeros(len(p_w), bool)
+        return np.any(told, axis=0) & (self._spent.away_m(p_w) > _AGAIN_M) if told else np.zeros(len(p_w), bool)
 
     def _opening_at(self, here_w: FloatArray) -> Candidate | None:
         """An opening about which a view from here would tell."""
@@ -145,7 +145,7 @@ class ViewPlanner:
         """Some of the cells, greedily by the uncovered border length that each adds."""
         p_w = layer.centres(cells).reshape(-1, 2)
         away = np.linalg.norm(p_w - here, axis=1)
-        shown = self._left.before(p_w) & (_away_m(p_w, self._places) > _AGAIN_M)[:, None]
+        shown = self._left.before(p_w) & (self._places.away_m(p_w) > _AGAIN_M)[:, None]
         chosen: list[int] = []
         while len(cells) and len(chosen) < _MOST:
             gain_m = shown.sum(1) * self._left.cell_m
@@ -159,7 +159,7 @@ class ViewPlanner:
 
     def _is_new(self, here_w: FloatArray) -> bool:
         """Whether to look from here: far enough from earlier looks with enough to see, or at a viewpoint."""
-        away_m = float(_away_m(here_w[None], self._places)[0])
+        away_m = float(self._places.away_m(here_w))
         if away_m > _EVERY_M:
             return bool(self._left.before(here_w[None]).sum() * self._left.cell_m >= _WORTH_M)
         there = (np.linalg.norm(self._spots_w - here_w, axis=1) < _THERE_M).any()
@@ -189,11 +189,6 @@ def _tells(opening: Candidate, p_w: FloatArray, inside_m: float = 0.0) -> np.nda
     apart = (before >= _BEFORE_M[0] + inside_m) & (before <= _BEFORE_M[1] - inside_m)
     fresh = np.linalg.norm(p_w[:, None] - opening.told_w, axis=-1).min(axis=1, initial=math.inf)
     return np.asarray(apart & (aside <= _ASIDE * before - inside_m) & (fresh >= PLACES_M + inside_m))
-
-
-def _away_m(p_w: FloatArray, places: Places) -> FloatArray:
-    """Distance [m] of points ``(P, 2)`` from the nearest place; infinite without one."""
-    return np.asarray(np.linalg.norm(p_w[:, None] - places.p_w, axis=-1).min(axis=1, initial=math.inf))
 
 
 def _in_turn(turns_rad: list[float]) -> list[float]:

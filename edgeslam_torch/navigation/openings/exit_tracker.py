@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
@@ -17,7 +16,7 @@ from edgeslam_torch.navigation.supervisor import DEAD_RECKONING_SIGMA_M
 from edgeslam_torch.types import FloatArray
 
 _EVERY_S = 0.5
-_SAME_M, _SAME_RAD = 0.5, math.radians(35.0)
+_SAME_M, _SAME_COS = 0.5, math.cos(math.radians(35.0))
 """Distance and angle within which detections belong to the same opening."""
 _PASSAGE_M = 1.0
 """Minimum distance between two doors along a passage."""
@@ -124,8 +123,8 @@ class _Track:
 
     def is_at(self, gap: Gap) -> bool:
         """Whether a detection belongs to it; the sign of the normal depends on the side of the drone."""
-        turned = math.acos(min(1.0, abs(float(gap.normal_w @ self.normal_w))))
-        return turned < _SAME_RAD and float(np.linalg.norm(gap.centre_w - self.centre_w)) < _SAME_M
+        near = float(np.linalg.norm(gap.centre_w - self.centre_w)) < _SAME_M
+        return near and abs(float(gap.normal_w @ self.normal_w)) > _SAME_COS
 
     def measure(self, gap: Gap) -> None:
         """Kalman update of centre, normal and width."""
@@ -262,7 +261,7 @@ def _one_passage(exit_: Exit, other: Exit) -> bool:
     offset, normal = exit_.centre_w - other.centre_w, other.normal_w
     along = abs(float(offset @ normal))
     beside = math.sqrt(max(0.0, float(offset @ offset) - along**2))
-    parallel = abs(float(exit_.normal_w @ normal)) > math.cos(_SAME_RAD)
+    parallel = abs(float(exit_.normal_w @ normal)) > _SAME_COS
     behind = parallel and along < _PASSAGE_M and beside < 0.5 * max(exit_.width_m, other.width_m)
     return behind or float(np.linalg.norm(offset)) < _SAME_M
 
@@ -271,7 +270,7 @@ def _is_looked_at(track: _Track, state: DroneState) -> bool:
     """Whether the current view of an opening is valid: in range, in the field of view, not at a grazing angle."""
     offset = track.centre_w - state.p_w[:2]
     away = float(np.linalg.norm(offset))
-    bearing = float(wrapped(np.array(math.atan2(offset[1], offset[0]) - state.yaw_rad)))
+    bearing = state.turn_to_rad(math.atan2(offset[1], offset[0]))
     squarely = abs(float(offset @ track.normal_w)) > _SQUARELY_COS * away
     return _NEAREST_M < away < FARTHEST_M and abs(bearing) < FIELD_RAD and squarely
 
