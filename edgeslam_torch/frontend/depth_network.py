@@ -267,12 +267,13 @@ class _OnnxEngine:
         if path.suffix == ".onnx":
             from edgeslam_torch.models.onnx.file import read_onnx
 
-            content, self.metadata = read_onnx(weights)
+            model: Path | bytes
+            model, self.metadata = read_onnx(weights)
         else:
-            from edgeslam_torch.models.onnx.graph import build_graph
+            from edgeslam_torch.models.onnx.cache import cached_graph
 
-            content, self.metadata = build_graph(path)
-        self._session = open_session(content, path, threads, device)
+            model, self.metadata = cached_graph(path)
+        self._session = open_session(model, path, threads, device)
         self.device = device_of(self._session)
         height, width = self._session.get_inputs()[0].shape[2:]
         self.fixed_size = (height, width) if isinstance(height, int) and isinstance(width, int) else None

@@ -31,12 +31,12 @@ def has_onnxruntime() -> bool:
     return importlib.util.find_spec("onnxruntime") is not None
 
 
-def open_session(content: bytes, weights: Path, threads: int, device: str = "cpu") -> "InferenceSession":
+def open_session(model: Path | bytes, weights: Path, threads: int, device: str = "cpu") -> "InferenceSession":
     """Load a network.
 
     Args:
-        content: The ONNX file.
-        weights: Its path, for messages.
+        model: The ONNX file or its content, which the session keeps in memory.
+        weights: The file that the user named, for messages.
         threads: Threads per inference.
         device: One of `edgeslam_torch.models.device.DEVICES`; ``auto`` selects CUDA if it works.
 
@@ -53,7 +53,7 @@ def open_session(content: bytes, weights: Path, threads: int, device: str = "cpu
     options.log_severity_level = 4  # errors are raised as exceptions
     wanted = onnx_providers(device)
     try:
-        session = onnxruntime.InferenceSession(content, options, providers=wanted)
+        session = onnxruntime.InferenceSession(model, options, providers=wanted)
     except Exception as error:  # onnxruntime's errors have no common base class
         raise WeightsError(f"{weights}: onnxruntime cannot load it ({first_line(error)})") from error
     # onnxruntime silently falls back to the next provider if libraries or the GPU are missing.

@@ -1,0 +1,36 @@
+"""The shipped networks' ONNX files in the cache."""
+
+import shutil
+
+import pytest
+
+from edgeslam_torch.models.onnx.cache import cached_graph
+from edgeslam_torch.models.onnx.graph import build_graph
+from edgeslam_torch.models.record import DEFAULT_WEIGHTS
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def test_a_shipped_network_is_made_once(cache):
+    file, metadata = cached_graph(DEFAULT_WEIGHTS)
+    assert (file.read_bytes(), metadata) == build_graph(DEFAULT_WEIGHTS)
+    made = file.stat()
+    assert cached_graph(DEFAULT_WEIGHTS) == (file, metadata)
+    assert (file.stat().st_mtime_ns, file.stat().st_ino) == (made.st_mtime_ns, made.st_ino)
+    assert list(cache.iterdir()) == [file]
+
+
+def test_a_cache_that_cannot_be_written_costs_time_only(cache):
+    cache.write_text("a file where the folder should be")
+    assert cached_graph(DEFAULT_WEIGHTS) == build_graph(DEFAULT_WEIGHTS)
+
+
+def test_weights_of_the_users_own_leave_nothing(cache, tmp_path):
+    own = tmp_path / "tuned.safetensors"
+    shutil.copy(DEFAULT_WEIGHTS, own)
+    assert cached_graph(own) == build_graph(own)
+    assert not cache.exists()
