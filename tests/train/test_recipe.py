@@ -282,21 +282,7 @@ def test_interrupt_after_an_explosion_saves_no_ruin(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [
-        {"lr": 0.0},
-        {"lr": -1e-3},
-        {"lr": float("nan")},
-        {"lr": float("inf")},
-        {"lr": 2.0},
-        {"encoder_lr": 0.0},
-        {"steps": 0},
-        {"batch": 0},
-        {"seed": -1},
-        {"patience": -1},
-        {"validate_every": 0},
-        {"accumulate": 5},
-    ],
+    "wrong", [{"lr": 0.0}, {"lr": float("nan")}, {"encoder_lr": 2.0}, {"batch": 0}, {"seed": -1}, {"accumulate": 5}]
 )
 def test_settings_that_cannot_train_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} must"):
@@ -360,21 +346,47 @@ def test_learning_rate_rises_then_falls() -> None:
     assert all(a >= b for a, b in zip(factors[9:], factors[10:], strict=False))
 
 
-ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-SCRIPT = """
+ENVIRONMENT = os.environ | {
+    "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]),
+    "OMP_NUM_THREADS": "1",
+}
+BEGIN = f"""
 import sys, torch
 from pathlib import Path
-from edgeslam_torch.train.processes.distributed import process_group
-sys.path.insert(0, {folder!r})
-from {module} import METADATA, network, replace, shared_config, train, two_recordings
+from edgeslam_torch.train.processes.distributed import process_group, rank
+from {Path(__file__).stem} import *
+from {Path(__file__).stem} import _PoisonedAt
 torch.set_num_threads(1)
-with process_group() as rank:
+"""
+TWO_RECORDINGS = """
+with process_group():
     config = shared_config(frozen=sys.argv[3] == "frozen")
     state = train(network(), METADATA, [two_recordings()], config, Path(sys.argv[1]))
-    if rank == 0:
+    if rank() == 0:
         torch.save([state.network.state_dict(), state.averaged.state_dict()], sys.argv[2])
 threads = [path.read_text() for path in Path("/proc/self/task").glob("*/comm")]
 assert not [name for name in threads if "gloo" in name], "the group's threads would abort the process at its end"
+"""
+POISONED = """
+with process_group():
+    poisoned = _PoisonedAt([Source("made", views(), 1.0)], METADATA)
+    poisoned.step, poisoned.image = 3 if rank() else 99, 0
+    try:
+        train(network(), METADATA, [poisoned], replace(CONFIG, freeze_norm=True), Path(sys.argv[1]))
+    except NonFiniteLossError as error:
+        sys.exit(str(error))
+"""
+STOPPED = """
+class Stop(Hooks):
+    def on_step(self, state, losses):
+        if rank() == 1 and state.step == 2:
+            state.stop = "asked for by the second"
+
+    def on_end(self, state, reason):
+        sys.stderr.write(f"{reason} at {state.step}")
+
+with process_group():
+    train(network(), METADATA, [signal()], replace(CONFIG, freeze_norm=True), Path(sys.argv[1]), hooks=[Stop()])
 """
 
 
@@ -388,13 +400,13 @@ def shared_config(frozen: bool) -> TrainConfig:
     return replace(CONFIG, steps=20, batch=5, freeze_norm=frozen, checkpoint_every=20)
 
 
-def in_two_processes(script: Path, *words: str) -> list[tuple[int, str]]:
+def in_two_processes(script: str, *words: str) -> list[tuple[int, str]]:
     """Exit code and stderr of each process of a group that runs a script."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-    command = [sys.executable, str(script), *words]
+    command = [sys.executable, "-c", BEGIN + script, *words]
     workers = [
         subprocess.Popen(command, env=ENVIRONMENT | group | {"RANK": str(rank)}, stderr=subprocess.PIPE, text=True)
         for rank in range(2)
@@ -406,10 +418,8 @@ def in_two_processes(script: Path, *words: str) -> list[tuple[int, str]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("norms", ["frozen", "learning"])
 def test_two_processes_on_two_recordings_give_the_single_process_result(tmp_path: Path, norms: str) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(SCRIPT.format(folder=str(Path(__file__).parent), module=Path(__file__).stem))
     together = tmp_path / "together.pt"
-    ended = in_two_processes(script, str(tmp_path / "b"), str(together), norms)
+    ended = in_two_processes(TWO_RECORDINGS, str(tmp_path / "b"), str(together), norms)
     assert [code for code, _ in ended] == [0, 0], ended
     config = shared_config(frozen=norms == "frozen")
     alone = train(network(), METADATA, [two_recordings()], config, tmp_path / "a")
@@ -532,28 +542,9 @@ def test_float16_leaves_out_steps_that_overflow(tmp_path: Path, monkeypatch: pyt
     assert again.scaler.get_scale() == scales[-1], "a resume remembers it"
 
 
-POISONED = """
-import sys, torch
-from pathlib import Path
-from edgeslam_torch.train.processes.distributed import process_group, rank
-sys.path.insert(0, {folder!r})
-from {module} import CONFIG, METADATA, NonFiniteLossError, Source, _PoisonedAt, network, replace, train, views
-torch.set_num_threads(1)
-with process_group() as rank:
-    poisoned = _PoisonedAt([Source("made", views(), 1.0)], METADATA)
-    poisoned.step, poisoned.image = 3 if rank else 99, 0
-    try:
-        train(network(), METADATA, [poisoned], replace(CONFIG, freeze_norm=True), Path(sys.argv[1]))
-    except NonFiniteLossError as error:
-        sys.exit(str(error))
-"""
-
-
 @pytest.mark.slow
 def test_loss_that_is_not_finite_in_one_process_stops_all_with_its_name(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(POISONED.format(folder=str(Path(__file__).parent), module=Path(__file__).stem))
-    ended = in_two_processes(script, str(tmp_path / "out"))
+    ended = in_two_processes(POISONED, str(tmp_path / "out"))
     named = Supervised([Source("made", views(), 1.0)], METADATA).describe([Slot(0, 3, 1)])[0]
     for code, said in ended:
         assert code == 1
@@ -561,31 +552,8 @@ def test_loss_that_is_not_finite_in_one_process_stops_all_with_its_name(tmp_path
         assert "last.pt holds step 2, the last good one" in said
 
 
-STOPPED = """
-import sys, torch
-from pathlib import Path
-from edgeslam_torch.train.processes.distributed import process_group, rank
-sys.path.insert(0, {folder!r})
-from {module} import CONFIG, METADATA, Hooks, network, replace, signal, train
-torch.set_num_threads(1)
-
-class Stop(Hooks):
-    def on_step(self, state, losses):
-        if rank() == 1 and state.step == 2:
-            state.stop = "asked for by the second"
-
-    def on_end(self, state, reason):
-        sys.stderr.write(f"{{reason}} at {{state.step}}")
-
-with process_group():
-    train(network(), METADATA, [signal()], replace(CONFIG, freeze_norm=True), Path(sys.argv[1]), hooks=[Stop()])
-"""
-
-
 @pytest.mark.slow
 def test_stop_that_one_process_asks_for_ends_all_after_the_same_step(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(STOPPED.format(folder=str(Path(__file__).parent), module=Path(__file__).stem))
-    for code, said in in_two_processes(script, str(tmp_path / "out")):
+    for code, said in in_two_processes(STOPPED, str(tmp_path / "out")):
         assert code == 0
         assert "asked for by the second at 2" in said

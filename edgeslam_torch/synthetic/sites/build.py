@@ -10,7 +10,7 @@ from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.synthetic.house import dressing
 from edgeslam_torch.synthetic.house.scene import Place, Scene, random_paint
-from edgeslam_torch.synthetic.house.walls import Opening, block, shell, side_of, wall
+from edgeslam_torch.synthetic.house.walls import SIDES, Opening, block, shell, side_of, wall
 from edgeslam_torch.synthetic.house.world import Box, World
 from edgeslam_torch.synthetic.sites.mirror import mirrored
 from edgeslam_torch.synthetic.sites.obstacles import connected, stand_in_the_way
@@ -29,6 +29,8 @@ is promised."""
 _EPS_M = 1e-6
 _MAX_M = 200.0
 """Extent of a scene: beyond, the search for a free way takes gigabytes."""
+_BESIDE_M = 0.15
+"""Kept free on both sides of a door."""
 _TRIES = 100
 """Furniture at random may stand in a doorway: another draw has it elsewhere."""
 _OPEN_RAD = (1.6, 1.8)
@@ -55,6 +57,8 @@ class _Layout:
     """x, y and heading [degrees]."""
     way: list[list[float]] = field(default_factory=list)
     exits: list[TrueExit] = field(default_factory=list)
+    gaps: list[_Wall] = field(default_factory=list)
+    """Parts of walls at which nothing may stand: doors, and where there is no wall."""
     panes: list[Box] = field(default_factory=list)
     """Glass: solid and not painted."""
     walkers: list[Walker] = field(default_factory=list)
@@ -133,7 +137,7 @@ def _laid_out(file: SceneFile, rng: Rng, given: dict[str, float]) -> _Layout:
     for rug in file.rug:
         dressing.rug(scene, rng, value(rug.x), value(rug.y))
     for dress in file.dress:
-        _dress(scene, rng, dress, file.pieces, value, *_room(rooms, dress.room))
+        _dress(layout, rng, dress, file.pieces, value, *_room(rooms, dress.room))
     layout.way = [value(point) for point in file.way]
     for point in (layout.start[:2], *layout.way) if file.start else ():
         if not any((a < point).all() and (point < b).all() for a, b in rooms.values()):
@@ -228,8 +232,9 @@ def _walls(file: SceneFile, rng: Rng, value: Values, rooms: dict[str, FloatArray
                 if high - low > _EPS_M and abs(first[1, axis] - second[0, axis]) < _EPS_M:
                     shared[frozenset((a, b))] = _Wall(axis, first[1, axis], low, high)
     for pair in file.open:
-        if shared.pop(frozenset(pair), None) is None:
+        if (gap := shared.pop(frozenset(pair), None)) is None:
             raise ConfigError(f"open: rooms {pair[0]!r} and {pair[1]!r} do not touch")
+        layout.gaps.append(gap)
     walls: list[_Wall] = []
     for part in sorted(shared.values(), key=lambda w: (-w.axis, w.at, w.low)):
         last = walls[-1] if walls else None
@@ -252,6 +257,8 @@ def _walls(file: SceneFile, rng: Rng, value: Values, rooms: dict[str, FloatArray
             if abs(other.at_m - (at - whole.low)) < 0.5 * (other.width_m + width):
                 raise ConfigError(f"{where}: overlaps another door")
         whole.openings = sorted([*whole.openings, Opening(at - whole.low, width, height, leaf)], key=lambda o: o.at_m)
+        half = 0.5 * width + _BESIDE_M
+        layout.gaps.append(_Wall(edge.axis, edge.at, at - half, at + half))
         if is_open:
             centre, normal = np.full(3, 0.5 * height), np.zeros(3)
             centre[edge.axis], centre[1 - edge.axis] = edge.at, at
@@ -261,32 +268,48 @@ def _walls(file: SceneFile, rng: Rng, value: Values, rooms: dict[str, FloatArray
 
 
 def _dress(
-    scene: Scene, rng: Rng, dress: Dress, pieces: tuple[str, ...], value: Values, low: FloatArray, high: FloatArray
+    layout: _Layout, rng: Rng, dress: Dress, pieces: tuple[str, ...], value: Values, low: FloatArray, high: FloatArray
 ) -> None:
-    """Dress the walls of a room."""
+    """Dress the walls of a room, where they have no door and are not open."""
+    scene = layout.scene
     margin, height = value(dress.margin), float(scene.high_w[2])
 
-    def foot(side: str) -> tuple[Place, float]:
-        place, length = side_of(low, high, side)
-        return place, length - 2 * margin
+    def feet(side: str) -> list[tuple[Place, float]]:
+        """Place and length of the parts of a wall, the longest first."""
+        k = SIDES.index(side)
+        along, at = k % 2, (high if side in ("east", "north") else low)[1 - k % 2]
+        first, last = low[along] + margin, high[along] - margin
+        cuts = [(g.low, g.high) for g in layout.gaps if g.axis != along and abs(g.at - at) < _EPS_M]
+        cuts = sorted(cut for cut in cuts if cut[0] < last - _EPS_M and cut[1] > first + _EPS_M)
+        if not cuts:
+            place, length = side_of(low, high, side)
+            return [(place, length - 2 * margin)]
+        ends = [(a, b) for a, b in zip([first, *(c[1] for c in cuts)], [*(c[0] for c in cuts), last], strict=True)]
+        parts = []
+        for a, b in sorted(ends, key=lambda e: e[0] - e[1]):
+            part = np.array([low, high])
+            part[:, along] = a, b
+            parts += [side_of(part[0], part[1], side)] if b - a > _EPS_M else []
+        return parts
 
     if dress.style == "doors":
         for _ in range(int(rng.integers(2, 4))):
-            place, length = foot(dress.walls[int(rng.choice(len(dress.walls)))])
-            dressing.blind_door(scene, place.at(rng.uniform(-0.5, 0.5) * (length - 2.0), 0.0), rng)
+            for place, length in feet(dress.walls[int(rng.choice(len(dress.walls)))])[:1]:
+                dressing.blind_door(scene, place.at(rng.uniform(-0.5, 0.5) * (length - 2.0), 0.0), rng)
         return
     order = rng.permutation(len(dress.walls)).tolist() if dress.shuffle else range(len(dress.walls))
     for side in (dress.walls[k] for k in order):
-        place, length = foot(side)
-        if dress.style == "door":
-            dressing.blind_door(scene, place, rng)
-        elif dress.style == "corridor":
-            dressing.line_wall(scene, place, length, rng, height)
-        else:
-            dressing.furnish_wall(
-                scene, place, length, rng, height, density=value(dress.density), door=side == dress.door,
-                pictures=value(dress.pictures), names=dress.pieces or pieces,
-            )  # fmt: skip
+        for n, (place, length) in enumerate(feet(side)):
+            if dress.style == "door":
+                if n == 0:
+                    dressing.blind_door(scene, place, rng)
+            elif dress.style == "corridor":
+                dressing.line_wall(scene, place, length, rng, height)
+            else:
+                dressing.furnish_wall(
+                    scene, place, length, rng, height, density=value(dress.density),
+                    door=side == dress.door and n == 0, pictures=value(dress.pictures), names=dress.pieces or pieces,
+                )  # fmt: skip
 
 
 def _list(value: float | list[float]) -> list[float]:

@@ -49,6 +49,16 @@ def test_walls_and_doors_stand_where_they_are_written(flat, p, away):
     assert free_at(flat, p) == pytest.approx(away, abs=0.035)  # frames and skirting boards
 
 
+@pytest.mark.parametrize("style", ["furniture", "corridor"])
+def test_nothing_stands_in_the_doors_of_a_dressed_wall(tmp_path, style):
+    dress = f'dress = [{{ room = "a", walls = ["east"], style = "{style}", density = 1.0 }}]'
+    (tmp_path / "dressed.toml").write_text(FLAT + dress)
+    for seed in range(3):
+        site = named_site(str(tmp_path / "dressed.toml"), seed)
+        assert free_at(site, (5.0, 1.4, 1.0)) == pytest.approx(0.55, abs=0.035)
+        assert free_at(site, (4.7, 1.4, 0.8)) > 0.5
+
+
 def test_the_drone_starts_at_the_origin_of_its_own_world(flat):
     assert flat.in_site(np.zeros(3)) == pytest.approx([0.8, 2.0, 0.0])
     assert flat.in_site(flat.goal_w) == pytest.approx([6.0, 5.2, 1.1])
