@@ -36,16 +36,15 @@ stiff modes never corrects (docs/decisions/12-solver.md)."""
 
 def lm_config(config: WindowConfig) -> LmConfig:
     """Solver settings of every refinement of the map."""
-    squares = {"delta": math.inf, "edge_delta": math.inf} if config.reprojection == "literal" else {}
-    return LmConfig(
+    robust = LmConfig(
         solver=config.solver,
         diagnostics=False,
         max_iterations=0 if config.reprojection == "off" else ITERATIONS,
         mu=MU,
         cost_tolerance=COST_TOLERANCE,
         pose_tolerance=POSE_TOLERANCE,
-        **squares,
     )
+    return replace(robust, delta=math.inf, edge_delta=math.inf) if config.reprojection == "literal" else robust
 
 
 def last_refinement(

@@ -34,7 +34,7 @@ MIN_COUNT = 30
 
 def term_sigmas(residuals: dict[str, FloatArray]) -> dict[str, float]:
     """Standard deviation of every term from its valid residuals; the usual one without enough of them."""
-    sigmas = {}
+    sigmas: dict[str, float] = {}
     for name, (usual, low, high) in SCALES.items():
         found = residuals.get(name, np.zeros(0))
         measured = robust_sigma(found) if found.size >= MIN_COUNT else usual
