@@ -20,8 +20,9 @@ PX_PER_TURN = 9.0
 class EdgeField:
     """Edge pixels of a keyframe, indexed by position and direction."""
 
-    tree: cKDTree
-    """Over ``(u, v, s nx, s ny)`` with ``s`` `PX_PER_TURN`, ``(E, 4)``."""
+    tree: cKDTree | None
+    """Over ``(u, v, s nx, s ny)`` with ``s`` `PX_PER_TURN`, ``(E, 4)``; None to build one for each query, which is as
+    fast for a field that is queried once, and saves its memory."""
     edges: Edges
     inverse_depth: FloatArray
     """``(E,)`` inverse depths of its edges [1/m]; zero where unknown."""
@@ -29,21 +30,27 @@ class EdgeField:
     """Width and height of the image [px]."""
 
 
-def edge_field(edges: Edges, inverse_depth: FloatArray, size: tuple[int, int]) -> EdgeField:
+def edge_field(edges: Edges, inverse_depth: FloatArray, size: tuple[int, int], indexed: bool = True) -> EdgeField:
     """Index a keyframe's edges.
 
     Args:
         edges: Edge pixels with their normals.
         inverse_depth: ``(E,)`` [1/m], zero where unknown.
         size: Width and height [px].
+        indexed: Whether to keep a search tree.
     """
-    return EdgeField(cKDTree(_place(edges.uv, edges.normal)), edges, np.asarray(inverse_depth), size)
+    return EdgeField(_tree(edges) if indexed else None, edges, np.asarray(inverse_depth), size)
 
 
 def nearest_edges(field: EdgeField, uv: FloatArray, normal: FloatArray) -> IntArray:
     """Indices ``(N,)`` of the edge pixels nearest to pixels ``(N, 2)`` in position and direction."""
-    found: IntArray = field.tree.query(_place(uv, normal))[1]
+    tree = _tree(field.edges) if field.tree is None else field.tree
+    found: IntArray = tree.query(_place(uv, normal))[1]
     return found
+
+
+def _tree(edges: Edges) -> cKDTree:
+    return cKDTree(_place(edges.uv, edges.normal))
 
 
 def _place(uv: FloatArray, normal: FloatArray) -> FloatArray:

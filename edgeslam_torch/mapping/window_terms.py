@@ -79,6 +79,7 @@ def make_structure(
     inverse_depth: FloatArray,
     sigma: FloatArray,
     mask: NDArray[np.bool_] | None = None,
+    indexed: bool = True,
 ) -> Structure:
     """Index a keyframe's edges of known depth for its neighbours.
 
@@ -88,6 +89,7 @@ def make_structure(
         inverse_depth: ``(E,)`` [1/m].
         sigma: ``(E,)`` standard deviations [1/m].
         mask: ``(H, W)`` Canny edges, for L-junctions; without it none are detected.
+        indexed: As `edge_field` takes it.
     """
     height, width = grey.shape
     smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)
@@ -96,7 +98,7 @@ def make_structure(
     normal = _unit(np.stack(gradient, 1)).astype(np.float32)
     edges = Edges(np.asarray(uv, dtype=np.float32).reshape(-1, 2), normal, np.repeat(grey[v, u][:, None], 3, 1))
     junctions = None if mask is None else detect_junctions(grey, mask)
-    return Structure(edge_field(edges, inverse_depth, (width, height)), np.asarray(sigma), junctions)
+    return Structure(edge_field(edges, inverse_depth, (width, height), indexed), np.asarray(sigma), junctions)
 
 
 def nearest_poses(T_c_w: FloatArray, count: int) -> IntArray:
