@@ -48,9 +48,9 @@ _MIN_REFINED = 20
 """Minimum number of keyframes: a short sideways motion fits half the focal length with other depths, with a meaningless
 sigma."""
 _REFINED_KEYFRAMES, _REFINED_ANCHORS = 40, 600
-"""Maximum numbers of keyframes and anchors for a refinement with a free focal length: up to 1.5 s of CPU, once per
-run."""
-_REFINEMENT = LmConfig(diagnostics=False, max_iterations=30, mu=1e-8, cost_tolerance=1e-6)
+"""Maximum numbers of keyframes and anchors for a refinement with a free focal length: up to half a second of CPU, once
+per run."""
+_REFINEMENT = LmConfig(diagnostics=False, max_iterations=30, mu=1e-8, cost_tolerance=1e-6, pose_tolerance=1.0)
 _NEWTON_STEPS, _FOCAL_STEP, _MAX_MOVE, _CONVERGED = 10, 0.04, 0.25, 0.01
 """Newton's method for the log focal length: number of steps, step of the numerical derivative, largest change, and
 convergence threshold."""
@@ -170,13 +170,13 @@ def calibration_warning(camera: Camera, keyframes: Sequence[Keyframe], p_w: Floa
         p_w: The map's anchors ``(A, 3)`` by id; None to go by fundamental matrices alone.
 
     Returns:
-        A warning if a refinement of the map with a free focal length, or fundamental matrices of neighbours,
-        contradict the focal length; None if they agree or the motion is insufficient.
+        A warning if a refinement of the map with a free focal length contradicts the focal length, or where the map
+        fits none, fundamental matrices of neighbours; None if they agree or the motion is insufficient.
     """
     if camera.focal_sigma > MAX_RELATIVE_SIGMA:
         return None
     estimate = None if p_w is None else focal_from_map(camera, keyframes, p_w)
-    if estimate is None or not contradicts(estimate, camera):
+    if estimate is None or estimate.focal_px is None:
         estimate = _focal_from_keyframes(camera, keyframes)
     if estimate.focal_px is None or not contradicts(estimate, camera):
         return None
