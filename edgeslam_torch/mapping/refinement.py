@@ -268,7 +268,7 @@ def write_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], resu
         slam_map.anchors.p_w[window.anchor] = result.p_w
         if result.stop is StopReason.MAX_ITERATIONS:
             return
-        bad = (result.chi2 > CHI2_2DOF_95) | ~result.in_front
+        bad = result.chi2 > CHI2_2DOF_95
         start = 0
         for keyframe, seen in zip(keyframes, keypoint, strict=True):
             wrong = seen[bad[start : start + len(seen)]]

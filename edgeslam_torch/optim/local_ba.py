@@ -53,11 +53,9 @@ def _unchanged(problem: WindowProblem, stop: StopReason) -> WindowResult:
         T_c_w=np.array(problem.T_c_w, dtype=np.float64),
         p_w=np.array(problem.p_w, dtype=np.float64),
         chi2=np.full(M, np.inf),
-        in_front=np.zeros(M, dtype=bool),
         cost_before=np.nan,
         cost_after=np.nan,
         iterations=0,
-        accepted=0,
         stop=stop,
         rank_deficiency=-1,
     )

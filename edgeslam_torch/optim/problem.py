@@ -271,21 +271,14 @@ class WindowResult:
     """``(A, 3)`` refined anchors."""
     chi2: FloatArray
     """``(M,)`` squared whitened reprojection residuals at the result; infinite behind the camera."""
-    in_front: NDArray[np.bool_]
-    """``(M,)`` whether the anchor lies in front of the camera."""
     cost_before: float
     """Robust cost (sum of rho) at the start."""
     cost_after: float
     iterations: int
     """Steps tried."""
-    accepted: int
     stop: StopReason
     edge_inverse_depth: FloatArray = field(default_factory=lambda: np.zeros(0))
     """``(E,)`` refined inverse depths of the edges."""
-    edge_sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """``(E,)`` their standard deviations with fixed poses; infinite if unobserved."""
-    edge_chi2: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """``(P,)`` squared whitened alignment residuals; infinite behind the camera."""
     junction_inverse_depth: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """``(C, 3)`` refined inverse depths of the junctions."""
     rank_deficiency: int = 0

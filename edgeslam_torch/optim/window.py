@@ -108,9 +108,8 @@ class Window:
     def refine(self) -> WindowResult:
         """Run the solver and collect the result."""
         system, summary = minimise(self, self.start, self.config)
-        normal: dict[Blocks, Normal] = dict(zip(self.blocks, system.blocks, strict=True))
         x: dict[Blocks, FloatArray] = dict(zip(self.blocks, system.state.x, strict=True))
-        anchors = normal[self.anchors]
+        anchors = system.blocks[0]
         deficiency, covariance = -1, np.full((6, 6), np.nan)
         if self.config.diagnostics and summary.stop is not StopReason.NOT_FINITE and len(self.free):
             deficiency, covariance = self._diagnose(system)
@@ -119,21 +118,15 @@ class Window:
             T_c_w=system.state.T_c_w,
             p_w=x[self.anchors],
             chi2=np.where(anchors.front, (anchors.r**2).sum(1), np.inf),
-            in_front=anchors.front,
             cost_before=summary.cost_before,
             cost_after=summary.cost_after,
             iterations=summary.iterations,
-            accepted=summary.accepted,
             stop=summary.stop if observed else StopReason.NO_OBSERVATIONS,
             rank_deficiency=deficiency,
             pose_covariance=covariance,
         )
         if self.edges is not None:
-            edges = normal[self.edges]
-            with np.errstate(divide="ignore"):
-                sigma = edges.V[:, 0, 0] ** -0.5
-            chi2 = np.where(edges.front, edges.r[:, 0] ** 2, np.inf)
-            out = replace(out, edge_inverse_depth=x[self.edges][:, 0], edge_sigma=sigma, edge_chi2=chi2)
+            out = replace(out, edge_inverse_depth=x[self.edges][:, 0])
         if self.junctions is not None:
             out = replace(out, junction_inverse_depth=x[self.junctions])
         return out

@@ -205,7 +205,7 @@ def consensus(
         scale_priors=(ScalePrior(0, newest, baseline, 0.001),),
     )
     result = refine_window(problem, LmConfig(max_iterations=20, diagnostics=True))
-    agreeing = (result.chi2 <= CHI2_2DOF_95) & result.in_front
+    agreeing = result.chi2 <= CHI2_2DOF_95
     covariance = result.pose_covariance[:3, :3]
     sigma = float(np.sqrt(np.trace(covariance))) / baseline if np.isfinite(covariance).all() else np.inf
     # A point must be an inlier in the two views that become keyframes.

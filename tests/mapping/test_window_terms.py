@@ -90,7 +90,6 @@ def test_terms_fit_at_the_true_poses(scene):
     assert len(junctions.pair_junction) > 60
     p = WindowProblem(T, np.ones(4, bool), np.zeros((0, 3)), *4 * [np.zeros(0)], K, edges=edges, junctions=junctions)
     result = refine_window(p, LmConfig(max_iterations=0))
-    assert np.median(result.edge_chi2) < 0.5
     # rows of a corner within 1 px and of an arm within 1 / 20 rad cost less than one each
     assert result.cost_after < 0.7 * (len(edges.pair_edge) + 4 * len(junctions.pair_junction))
 
