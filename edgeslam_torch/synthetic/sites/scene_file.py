@@ -234,10 +234,17 @@ def _record(kind: type[T], table: dict[str, Any], where: str) -> T:
     return dataclasses.replace(part, values=values) if values else part  # type: ignore[type-var]
 
 
+_MAX_STEPS = 1000
 _SYNTAX = (
     ast.Expression, ast.BinOp, ast.Add, ast.Sub, ast.Mult, ast.Div, ast.UnaryOp, ast.USub, ast.Compare, ast.cmpop,
     ast.IfExp, ast.Call, ast.Name, ast.Load, ast.Constant,
 )  # fmt: skip
+
+
+def _steps(first: float, end: float, step: float) -> list[float]:
+    if not (step and 0 <= (end - first) / step <= _MAX_STEPS):
+        raise ValueError(f"steps must be from 0 to {_MAX_STEPS}")
+    return list(np.arange(first, end, step).tolist())
 
 
 class Values:
@@ -249,7 +256,7 @@ class Values:
             "uniform": lambda low, high: float(rng.uniform(low, high)),
             "either": lambda *options: options[int(rng.random() * len(options))],
             "sample": lambda count, *options: set(rng.choice(options, count, replace=False).tolist()),
-            "steps": lambda first, end, step: np.arange(first, end, step).tolist(),
+            "steps": _steps,
         }
         self._known: dict[str, Any] = {}
         for name, value in scene.values.items():

@@ -40,6 +40,7 @@ def test_every_scene_of_ours_is_read_and_the_sites_are_among_them():
         ("at = 2", "at = '(1).real'", "is not arithmetic"),
         ("at = 2", "at = '1 / 0'", "cannot be computed"),
         ("at = 2", "at = 'uniform(1)'", "cannot be computed"),
+        ("at = 2", "at = 'steps(0, 1000000000000, 1)'", "cannot be computed"),
         ("at = 2", "at = 3.8", "door between 'a' and 'b': .* is not within 0 to 4"),
         ('"a", "b"]', '"a", "c"]', "no room 'c'"),
         ("at = 2", "at = '\"a\" * 2'", "is not arithmetic"),
