@@ -6,6 +6,8 @@ second. A reading quantised to a step has a standard deviation of the step over 
 
 import math
 
+import numpy as np
+
 # --- velocity ---------------------------------------------------------------------------------------------------------
 
 VELOCITY_SENSOR_M_S = 0.02
@@ -54,6 +56,20 @@ HEIGHT_MEMORY_S = 3.0
 HEIGHT_SCALE_LOG = 0.02
 """Systematic scale error of heights over a climb of decimetres, along which the map bends by a centimetre."""
 
+# --- IMU, beside the densities of `ImuModel` --------------------------------------------------------------------------
+
+GRAVITY_M_S2 = 9.81
+"""Between 9.78 and 9.83 on the ground; the scale inherits the difference."""
+IMU_BIAS_SIGMA = np.repeat([0.1, 0.3], 3)
+"""Of the biases at power-on [rad/s, m/s^2]: the larger one of cheap sensors, 30 mg."""
+IMU_SCALE_LOG = 0.01
+"""Error of the scale by the accelerometer's gain and axes, which averaging does not reduce: a percent beside the laser
+tracker of a real flight; data sheets allow 3 % (MPU-6050)."""
+KNOWN_MOUNT_RAD, KNOWN_LEVER_M, KNOWN_OFFSET_S = 1e-3, 2e-3, 2e-4
+"""Of what a calibration says."""
+UNKNOWN_MOUNT_RAD, UNKNOWN_LEVER_M, UNKNOWN_OFFSET_S = 0.1, 0.1, 0.02
+"""Of what the model does not say, once rotations have been compared: a camera and an IMU on one small drone."""
+
 # --- clocks -----------------------------------------------------------------------------------------------------------
 
 STAMP_S = 0.05
@@ -77,6 +93,9 @@ seconds before, and its correlation time."""
 MAP_WANDER_LOG = (0.03, 0.09, 0.27, 0.81)
 """Change of the log of the map's scale per e-fold of its age, usual first, of which the residuals choose: 2 to 14 % in
 the first seconds, later 1 to 2 %; with few features the scale may triple."""
+VISUAL_MEMORY_S = 0.5
+"""Correlation time of the errors of visual poses: those of a real drone's flight grow with the root of time up to about
+a second, the time between keyframes, and hardly beyond."""
 VISUAL_SIGMA = 0.01
 """Of a pose without a covariance [map units, rad]."""
 DEPTH_SCALE_LOG = 0.1
@@ -89,5 +108,7 @@ ANGULAR_ACCELERATION_RAD_S2 = 1.0
 """Of a hand or a small drone: constant velocity is off by 20 mm and 20 mrad after 0.2 s."""
 IMPLAUSIBLE_ACCELERATION_M_S2 = 10.0
 """Per axis, 1 g: a prior that is weak against images; hands and drones have 0.2 to 1.7."""
+FAST_M_S = 1e3
+"""Of a velocity that nothing tells, inside a gap of an IMU."""
 POSITION_FLOOR_M_SQRT_S = 1e-3
 """Minimum process noise of the filter, which keeps the covariance positive definite."""

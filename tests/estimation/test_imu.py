@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.estimation.inertial.alignment import CORRELATED_S
 from edgeslam_torch.estimation.sensors.imu import Imu
 from edgeslam_torch.imu import ImuModel, ImuReadings
+from edgeslam_torch.noise import VISUAL_MEMORY_S
 from edgeslam_torch.synthetic.flights.imu import ADIS16448, MPU6050, mounted, simulate_imu
 
 SCALE = 0.4
@@ -41,7 +41,7 @@ def flight(kind: str, model: ImuModel, seed: int, seconds: float = 15.0) -> Flig
     readings = simulate_imu(rng, t, T_w_c, model)
     T = T_w_c[25:-35:5].copy()
     error = rng.standard_normal((len(T), 6))
-    rho = math.exp(-0.1 / CORRELATED_S)
+    rho = math.exp(-0.1 / VISUAL_MEMORY_S)
     for k in range(1, len(T)):
         error[k] = rho * error[k - 1] + math.sqrt(1.0 - rho**2) * error[k]
     R_m_w = Rotation.random(rng=rng).as_matrix()

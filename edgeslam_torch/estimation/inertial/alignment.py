@@ -23,16 +23,21 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.estimation.inertial.preintegration import Preintegrated, preintegrate
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.imu import ImuModel, ImuReadings
+from edgeslam_torch.noise import (
+    FAST_M_S,
+    GRAVITY_M_S2,
+    IMU_BIAS_SIGMA,
+    IMU_SCALE_LOG,
+    KNOWN_LEVER_M,
+    KNOWN_MOUNT_RAD,
+    KNOWN_OFFSET_S,
+    UNKNOWN_LEVER_M,
+    UNKNOWN_MOUNT_RAD,
+    UNKNOWN_OFFSET_S,
+    VISUAL_MEMORY_S,
+)
 from edgeslam_torch.types import FloatArray
 
-GRAVITY_M_S2 = 9.81
-"""Between 9.78 and 9.83 on the ground; the scale inherits the difference."""
-CORRELATED_S = 0.5
-"""Correlation time of the errors of visual poses: those of a real drone's flight grow with the root of time up to
-about a second, the time between keyframes, and hardly beyond."""
-SYSTEMATIC_LOG = 0.01
-"""Error of the scale by the accelerometer's gain and axes, which averaging does not reduce: a percent beside the laser
-tracker of a real flight; data sheets allow 3 % (MPU-6050)."""
 LEAST_NODES = 24
 """Minimum number of nodes, 2.5 s: of fewer, the size of their errors is too uncertain."""
 _STEPS, _METRIC_STEPS = 12, 4
@@ -41,18 +46,10 @@ _CONVERGED, _LARGEST_LOG = 0.05, 20.0
 """Change of what is common to all nodes, in sigmas, at which the iteration ends; a log scale that has diverged."""
 _OUTLIER = 4.0
 """Error of one pose (6 numbers) from which on it counts linearly [standard deviations]: one in a hundred."""
-_BIAS_SIGMA = np.repeat([0.1, 0.3], 3)
-"""Standard deviation of the biases at power-on [rad/s, m/s^2]: the larger one of cheap sensors, 30 mg."""
-_FAST_M_S = 1e3
-"""Standard deviation of a velocity that nothing else tells, inside a gap."""
 _FLOOR_RAD, _FLOOR_SHARE = 1e-4, 1e-4
 """Least standard deviation of visual rotations, and of positions as a share of the extent of the way."""
 _START_RAD, _START_SHARE = 3e-3, 0.02
 """The same at the start of the iteration."""
-_UNKNOWN_MOUNT_RAD, _UNKNOWN_LEVER_M, _UNKNOWN_OFFSET_S = 0.1, 0.1, 0.02
-"""Standard deviation of what the model does not say, after `imu_mount`: a camera and an IMU on one small drone."""
-_KNOWN_MOUNT_RAD, _KNOWN_LEVER_M, _KNOWN_OFFSET_S = 1e-3, 2e-3, 2e-4
-"""Standard deviation of what a calibration says."""
 _NODE, _COMMON = 15, 10
 _SCALE, _GRAVITY, _MOUNT, _LEVER, _OFFSET = 0, slice(1, 3), slice(3, 6), slice(6, 9), 9
 
@@ -94,7 +91,7 @@ class Alignment:
     @property
     def sigma_log_scale(self) -> float:
         """Standard deviation of the log scale."""
-        return math.hypot(math.sqrt(self.covariance[_SCALE, _SCALE]), SYSTEMATIC_LOG)
+        return math.hypot(math.sqrt(self.covariance[_SCALE, _SCALE]), IMU_SCALE_LOG)
 
     @property
     def sigma_up_rad(self) -> float:
@@ -154,12 +151,9 @@ def align(
     whiten = there * np.linalg.inv(np.linalg.cholesky(np.where(there, pre.covariance, np.eye(9))))
     walk = np.repeat([model.gyroscope_random_walk, model.accelerometer_random_walk], 3)
     floor = _FLOOR_RAD, _FLOOR_SHARE * extent
-    unknown = known is None
-    sigma_known = np.array(
-        [_UNKNOWN_MOUNT_RAD if unknown else _KNOWN_MOUNT_RAD] * 3
-        + [_UNKNOWN_LEVER_M if unknown else _KNOWN_LEVER_M] * 3
-        + [_UNKNOWN_OFFSET_S if model.time_offset_s is None else _KNOWN_OFFSET_S]
-    )
+    mount_rad, lever_m = (UNKNOWN_MOUNT_RAD, UNKNOWN_LEVER_M) if known is None else (KNOWN_MOUNT_RAD, KNOWN_LEVER_M)
+    clock_s = UNKNOWN_OFFSET_S if model.time_offset_s is None else KNOWN_OFFSET_S
+    sigma_known = np.array([mount_rad] * 3 + [lever_m] * 3 + [clock_s])
     metric_steps = _METRIC_STEPS if before is None else 0
     for step in range(_STEPS):
         metric = step < metric_steps
@@ -232,7 +226,7 @@ def _error_sizes(
 ) -> tuple[float, float]:
     """Robust standard deviations of the errors of visual poses."""
     e, _ = _errors(x, R_m_c, z, offset_s, None, metric=False)
-    rho = np.exp(-dt_s / CORRELATED_S)[:, None]
+    rho = np.exp(-dt_s / VISUAL_MEMORY_S)[:, None]
     new = (e[1:] - rho * e[:-1]) / np.sqrt(1.0 - rho**2)
     sizes = [1.4826 * float(np.median(np.abs(part))) for part in (new[:, :3], new[:, 3:])]
     return max(sizes[0], floor[0]), max(sizes[1], floor[1])
@@ -287,7 +281,7 @@ def _linearised(
     C[:, 3:, _SCALE] = -math.exp(x.log_scale) * z if metric else -(e[:, 3:] + z)
     sigma_r, sigma_t = x.sigma_pose
     weight = np.repeat([1.0 / sigma_r, math.exp(-x.log_scale) / sigma_t if metric else 1.0 / sigma_t], 3)
-    rho = np.exp(-h / CORRELATED_S)
+    rho = np.exp(-h / VISUAL_MEMORY_S)
     fresh = weight / np.sqrt(1.0 - rho**2)
     r[:, 15:] = fresh * (e[1:] - rho * e[:-1])
     fresh, kept = fresh[:, :, None], (fresh * rho)[:, :, None]
@@ -326,9 +320,9 @@ def _solved(
     slope[0] += g[:n]
     common = common + g[n:]
     six = np.arange(9, 15)
-    own[:, 6 + np.arange(3), 6 + np.arange(3)] += _FAST_M_S**-2
-    own[0, six, six] += _BIAS_SIGMA**-2
-    slope[0, 9:] += _BIAS_SIGMA**-2 * bias
+    own[:, 6 + np.arange(3), 6 + np.arange(3)] += FAST_M_S**-2
+    own[0, six, six] += IMU_BIAS_SIGMA**-2
+    slope[0, 9:] += IMU_BIAS_SIGMA**-2 * bias
     known = np.arange(3, _COMMON)
     corner[known, known] += sigma_known**-2
     common[known] += sigma_known**-2 * apart
