@@ -243,6 +243,8 @@ class SlamMap:
 
         The newest observation gives descriptor and octave; the direction is the mean over all observations.
         """
+        if len(ids) == 0:
+            return
         wanted = np.zeros(len(self.anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
         wanted[ids] = True
         wanted[-1] = False
