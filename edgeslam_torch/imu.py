@@ -64,8 +64,12 @@ class ImuReadings(Record):
         values = np.abs(np.concatenate([self.angular_rate_rad_s, self.acceleration_m_s2], axis=1))
         for axis in range(0 if self.has_gyroscope else 3, 6) if len(self) >= _CLIPPED else ():
             column, known = values[:, axis], np.unique(values[:, axis])
-            runs = np.convolve(column == known[-1], np.ones(_CLIPPED), "valid") == _CLIPPED
-            if len(known) > 1 and runs.any() and known[-1] - known[0] > _STEPS * np.diff(known).min():
+            first = np.flatnonzero(np.diff(column, prepend=np.nan) != 0.0)
+            run, level = np.diff([*first, len(column)]), column[first]
+            # Slow sensors are read several times: readings repeat below the end of the range, too.
+            repeats = run[(level > 0.5 * known[-1]) & (level < known[-1])].max(initial=_CLIPPED - 1)
+            wide = len(known) > 1 and known[-1] - known[0] > _STEPS * np.diff(known).min()
+            if wide and run[level == known[-1]].max() > repeats:
                 ends[axis] = known[-1]
         return ends
 
