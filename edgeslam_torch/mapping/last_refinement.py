@@ -14,7 +14,7 @@ from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.freed_depths import Weight
 from edgeslam_torch.mapping.fuse import fuse_all
 from edgeslam_torch.mapping.motion_terms import ALIKE_AT_THE_END
-from edgeslam_torch.mapping.refinement import whole_map, window_problem, write_back
+from edgeslam_torch.mapping.refinement import refine, whole_map, window_problem, write_back
 from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.adaptive import term_residuals, term_sigmas, with_scales
 from edgeslam_torch.optim.local_ba import refine_window
@@ -50,9 +50,9 @@ def lm_config(config: WindowConfig) -> LmConfig:
 def last_refinement(
     slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: WindowConfig, telemetry: TelemetryModel | None = None
 ) -> WindowResult | None:
-    """Merge duplicate anchors, measure the remaining edges, refine everything once.
+    """Merge duplicate anchors, refine poses and anchors, measure the remaining edges, refine everything.
 
-    Windows in flight end at their minimum, so that no refinement of the anchors alone is needed before.
+    Edges are associated and weighted at the poses of the first refinement, which also removes outliers.
 
     Args:
         slam_map: Refined in place.
@@ -65,13 +65,15 @@ def last_refinement(
         The solver's result; None if there was nothing to refine.
     """
     lm = replace(lm_config(config), max_iterations=ITERATIONS, losses=True)
+    freed = Weight.NONE if config.reprojection == "off" else Weight.EXACT
     if config.reprojection != "off":
         with slam_map.lock:
             fuse_all(slam_map, camera)
+        if (window := whole_map(slam_map, freed, ALIKE_AT_THE_END)) is not None:
+            refine(slam_map, window, camera, lm, telemetry)
     edges.update(everything=True)
     with slam_map.lock:
         edges.follow_anchors()
-    freed = Weight.NONE if config.reprojection == "off" else Weight.EXACT
     window = whole_map(slam_map, freed, ALIKE_AT_THE_END)
     if window is None:
         return None
