@@ -18,7 +18,7 @@ if not os.path.exists(os.path.join(_HERE, "losses", "__init__.py")) and os.path.
     # A zip download or a Windows checkout has no symbolic links to models/, losses/, train/, eval/.
     __path__.append(_ROOT)
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _LAZY = {
     "Camera": "edgeslam_torch.geometry.camera",
