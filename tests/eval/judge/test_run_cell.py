@@ -190,7 +190,7 @@ def test_a_further_flight_has_another_path_through_the_same_world(tmp_path, monk
 
 @pytest.mark.slow
 def test_a_further_flight_through_the_building_takes_off_from_the_same_place(tmp_path, monkeypatch):
-    monkeypatch.setitem(COURSES, "building", replace(COURSES["building"], seconds=2.0, rate_hz=2.0))
+    monkeypatch.setitem(COURSES, "building", replace(COURSES["building"], seconds=6.0, rate_hz=2.0))
     assert flights.main("building", 0, tmp_path / "again", 1) == 0
     first = flights.flown(COURSES["building"], 0)[1].T_w_c[:, :3, 3]
     apart = np.linalg.norm(open_dataset(tmp_path / "again").truth.positions - first, axis=1)
