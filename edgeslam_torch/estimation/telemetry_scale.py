@@ -126,7 +126,7 @@ class _Shown:
 
     intervals: Displacements
     """On telemetry's clock."""
-    told: FloatArray
+    reported: FloatArray
     """``(N, 3)`` displacements by the raw readings [m]."""
     velocity: SeenVelocity
     start: float
@@ -292,11 +292,11 @@ class TelemetryScale:
         if shown is None:
             return None
         tilt, step = self._tilt_rad, self._config.velocity_step_m_s
-        intervals, told = shown.intervals, shown.told
+        intervals, reported = shown.intervals, shown.reported
         scale = shown.start
         for _ in range(_MOST_ROUNDS):
             lost = shown.velocity.lost(shown.ends_s, scale, step, rounding)
-            whole = told + lost[len(intervals) :] - lost[: len(intervals)]
+            whole = reported + lost[len(intervals) :] - lost[: len(intervals)]
             evidence = self._evidence(intervals, whole, self._aged(intervals.to_s))
             alone = None if evidence is None else solved([evidence], tilt)
             if evidence is None or alone is None:
@@ -342,8 +342,8 @@ class TelemetryScale:
             return None
         moved = moved.only(use).joined().on_telemetry_clock(self._delay_s)
         R_from, R_to = track.attitude(moved.from_s), track.attitude(moved.to_s)
-        told = track.displacement(np.concatenate([moved.from_s, moved.to_s]))
-        moved_m = told[len(moved) :] - told[: len(moved)] + (R_to - R_from) @ self._T_b_c[:3, 3]
+        reported = track.displacement(np.concatenate([moved.from_s, moved.to_s]))
+        moved_m = reported[len(moved) :] - reported[: len(moved)] + (R_to - R_from) @ self._T_b_c[:3, 3]
         moving = self._moving(moved, moved_m)
         if moving.sum() < 2:
             return None
@@ -417,5 +417,5 @@ class TelemetryScale:
         if segment[-1] > _MOST_STEPS * len(segment):
             segment = np.zeros_like(segment)
         least = max(_LEAST_CLIMB_M, _LEAST_CLIMB_SIGMAS * HEIGHT_M[reading])
-        seen, told = (changes(z, stamps_s, segment, _HEIGHT_BIN_S) for z in (z_map, z_m))
-        self._trust.judge(reading, agreement(seen, told, least / scale, least))
+        seen, reported = (changes(z, stamps_s, segment, _HEIGHT_BIN_S) for z in (z_map, z_m))
+        self._trust.judge(reading, agreement(seen, reported, least / scale, least))

@@ -60,14 +60,14 @@ def motion_factors(
             continue
         order = np.array(sorted(members, key=lambda i: keyframes[i].stamp_s), dtype=np.int64)
         stamps = np.array([keyframes[i].stamp_s for i in order])
-        told = model.positions(stamps, np.stack([keyframes[i].centre_w for i in order]), scale_sigma_log)
-        if told is not None:
+        reported = model.positions(stamps, np.stack([keyframes[i].centre_w for i in order]), scale_sigma_log)
+        if reported is not None:
             centres.append(
                 CentreFactor(
                     order,
-                    effective_samples * told.information,
-                    effective_samples * told.vector,
-                    effective_samples * told.constant,
+                    effective_samples * reported.information,
+                    effective_samples * reported.vector,
+                    effective_samples * reported.constant,
                 )
             )
         inert = inertia(stamps, model.scale) if model.knows_metres else None

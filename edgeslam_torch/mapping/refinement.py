@@ -212,7 +212,7 @@ def window_problem(
     priors, hosts = depth_priors(slam_map, window.anchor, [k.id for k in keyframes])
     # A single distance fixes the gauge and carries no information on the metric scale.
     doubt = UNKNOWN_SCALE_LOG if extent is not None else None
-    told = motion_factors(
+    reported = motion_factors(
         telemetry, keyframes, [slam_map.piece_of(k.id) for k in keyframes], doubt, window.effective_samples
     )
     motions = tracked_motions(slam_map, keyframes)
@@ -228,9 +228,9 @@ def window_problem(
         relative_priors=motions,
         scale_priors=() if extent is None else (extent,),
         depth_priors=priors,
-        centres=told.centres,
-        gravity=told.gravity,
-        headings=told.headings,
+        centres=reported.centres,
+        gravity=reported.gravity,
+        headings=reported.headings,
     )
     return replace(problem, relative_priors=(*motions, *motion_priors(problem, window.freed))), keypoint
 

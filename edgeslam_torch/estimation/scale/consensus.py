@@ -51,23 +51,25 @@ class Settled:
     """Warning about rejected estimates."""
 
 
-def settled_with_network(told: LogScale | None, network: LogScale | None, in_domain: bool) -> Settled:
+def settled_with_network(reported: LogScale | None, network: LogScale | None, in_domain: bool) -> Settled:
     """Reject contradictory estimates of the drone's sensors and of the depth network or an atlas.
 
     Args:
-        told: By velocities, heights or both.
+        reported: By velocities, heights or both.
         network: By the depth network, or by an atlas, whose metres include the network's estimate.
         in_domain: Whether the network may determine the scale; otherwise it only serves to detect gross errors.
     """
-    if told is None or network is None:
-        return Settled(tuple(o for o in (told, network if in_domain else None) if o is not None))
-    if not contradict(told, network):
-        return Settled((told, network) if in_domain else (told,))
-    scales = f"{math.exp(told.log_scale):.3g} and {math.exp(network.log_scale):.3g} metres per map unit"
+    if reported is None or network is None:
+        return Settled(tuple(o for o in (reported, network if in_domain else None) if o is not None))
+    if not contradict(reported, network):
+        return Settled((reported, network) if in_domain else (reported,))
+    scales = f"{math.exp(reported.log_scale):.3g} and {math.exp(network.log_scale):.3g} metres per map unit"
     other, short = ("atlas", "atlas") if network.source == "atlas" else ("depth network", "network")
-    said = f"telemetry ({told.source}) and the {other} contradict each other: {scales}"
-    if "+" in told.source:
-        return Settled((told,), f"{said}; velocities and heights confirm each other, so the {short} is not used")
-    if _apart(told, network) > _WRONG_UNIT_LOG:
+    said = f"telemetry ({reported.source}) and the {other} contradict each other: {scales}"
+    if "+" in reported.source:
+        return Settled((reported,), f"{said}; velocities and heights confirm each other, so the {short} is not used")
+    if _apart(reported, network) > _WRONG_UNIT_LOG:
         return Settled((), f"{said}; one of them is nonsense, and neither is used: is telemetry in the right unit?")
-    return Settled((told,), f"{said}; many measurements speak for telemetry, one error for the {other}: it is not used")
+    return Settled(
+        (reported,), f"{said}; many measurements speak for telemetry, one error for the {other}: it is not used"
+    )

@@ -37,7 +37,7 @@ class Turns:
 
     seen: FloatArray
     """``(N, 3, 3)`` by the images."""
-    told: FloatArray
+    reported: FloatArray
     """``(N, 3, 3)`` by telemetry."""
 
 
@@ -55,22 +55,22 @@ class Apart:
     """``(3,)`` root mean square of their rates [rad/s]."""
 
 
-def apart(told: Attitudes, R_b_c: FloatArray, sigma_rad: float) -> Apart:
+def apart(reported: Attitudes, R_b_c: FloatArray, sigma_rad: float) -> Apart:
     """Deviation between attitude and images over the whole flight, with mount and map rotation fitted.
 
     Attitudes, unlike their increments, reveal a jump, a frozen reading and a wrong sign: the rotation from the map to
     the power-on world must be the same in all frames.
 
     Args:
-        told: Both.
+        reported: Both.
         R_b_c: Configured camera in the body ``(3, 3)``.
         sigma_rad: Its standard deviation.
     """
-    turned = mount_by_turns(told.R_m_c, told.R_w_b, told.stamp_s, R_b_c, sigma_rad)
-    seen = turned.R_w_m @ told.R_m_c @ turned.R_b_c.T
-    off = Rotation.from_matrix(np.swapaxes(seen, 1, 2) @ told.R_w_b).as_rotvec()
+    turned = mount_by_turns(reported.R_m_c, reported.R_w_b, reported.stamp_s, R_b_c, sigma_rad)
+    seen = turned.R_w_m @ reported.R_m_c @ turned.R_b_c.T
+    off = Rotation.from_matrix(np.swapaxes(seen, 1, 2) @ reported.R_w_b).as_rotvec()
     rpy = np.unwrap(Rotation.from_matrix(seen).as_euler("ZYX")[:, ::-1], axis=0)
-    rate = np.diff(rpy, axis=0) / np.diff(told.stamp_s)[:, None]
+    rate = np.diff(rpy, axis=0) / np.diff(reported.stamp_s)[:, None]
     rms = [np.sqrt(np.mean(x**2, axis=0)) for x in (off, off[-LATELY:], rate)]
     return Apart(rms[0], rms[1], np.std(rpy, axis=0), rms[2])
 
@@ -96,8 +96,8 @@ def map_to_world(sightings: Sightings, track: TelemetryTrack, delay_s: float, R_
     Returns:
         ``R_w_m`` ``(3, 3)``, map axes to the power-on world; ``None`` where no attitude covers a pose.
     """
-    told = attitudes(sightings, track, delay_s)
-    return None if told is None else told.map_to_world(R_b_c)
+    reported = attitudes(sightings, track, delay_s)
+    return None if reported is None else reported.map_to_world(R_b_c)
 
 
 def turns(moved: Displacements, track: TelemetryTrack, R_b_c: FloatArray) -> Turns:
@@ -109,5 +109,5 @@ def turns(moved: Displacements, track: TelemetryTrack, R_b_c: FloatArray) -> Tur
         R_b_c: Camera in the body ``(3, 3)``.
     """
     seen = R_b_c @ np.swapaxes(moved.R_from, 1, 2) @ moved.R_to @ R_b_c.T
-    told = np.swapaxes(track.attitude(moved.from_s), 1, 2) @ track.attitude(moved.to_s)
-    return Turns(seen, told)
+    reported = np.swapaxes(track.attitude(moved.from_s), 1, 2) @ track.attitude(moved.to_s)
+    return Turns(seen, reported)

@@ -128,14 +128,14 @@ class Comparison:
         if len(moved) == 0:
             return Agreement()
         duration = moved.duration_s[:, None]
-        told = track.displacement(moved.to_s - delay_s) - track.displacement(moved.from_s - delay_s)
+        reported = track.displacement(moved.to_s - delay_s) - track.displacement(moved.from_s - delay_s)
         slow = self._config.min_speed_m_s
         least_seen = math.inf if present.rough_scale is None else 2.0 * slow / present.rough_scale
-        seen, told = moved.moved @ R_w_m.T / duration, told / duration
-        found = agreement(seen, told, least_seen, slow, early=True)
+        seen, reported = moved.moved @ R_w_m.T / duration, reported / duration
+        found = agreement(seen, reported, least_seen, slow, early=True)
         R_w = track.axes()[np.searchsorted(track.readings.stamp_s, 0.5 * (moved.from_s + moved.to_s) - delay_s)]
-        seen, told = (np.einsum("nwa,nw->na", R_w, v) for v in (seen, told))
-        return replace(found, broken=broken_columns(seen, told))
+        seen, reported = (np.einsum("nwa,nw->na", R_w, v) for v in (seen, reported))
+        return replace(found, broken=broken_columns(seen, reported))
 
     def _attitude(self, present: FlightSoFar, delay: Delay) -> Agreement | None:
         """Agreement of attitude with the images; None without common intervals."""
@@ -143,8 +143,10 @@ class Comparison:
         if len(moved) == 0:
             return None
         both = turns(moved.on_telemetry_clock(delay.value_s), present.track, present.R_b_c)
-        seen, told = (Rotation.from_matrix(R).as_rotvec() / moved.duration_s[:, None] for R in (both.seen, both.told))
-        found = agreement(seen, told, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
+        seen, reported = (
+            Rotation.from_matrix(R).as_rotvec() / moved.duration_s[:, None] for R in (both.seen, both.reported)
+        )
+        found = agreement(seen, reported, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
         return replace(found, broken=self._broken_attitude(present, delay))
 
     def _broken_attitude(self, present: FlightSoFar, delay: Delay) -> tuple[str, ...]:
@@ -154,17 +156,17 @@ class Comparison:
         delays_s = [delay.value_s] if known else np.arange(low, high + 1e-9, _DELAY_STEP_S).tolist()
         ratios = []
         for delay_s in delays_s:
-            told = attitudes(sightings, present.track, delay_s)
-            if told is not None and len(told.stamp_s) >= _FEW_ATTITUDES:
-                ratios.append(self._parted(told, present.R_b_c, delay.sigma_s if known else _DELAY_STEP_S))
+            reported = attitudes(sightings, present.track, delay_s)
+            if reported is not None and len(reported.stamp_s) >= _FEW_ATTITUDES:
+                ratios.append(self._parted(reported, present.R_b_c, delay.sigma_s if known else _DELAY_STEP_S))
         if not ratios:
             return ()
         best = min(ratios, key=max)
         return tuple(name for name, ratio in zip(ATTITUDE, best.tolist(), strict=True) if ratio > 1.0)
 
-    def _parted(self, told: Attitudes, R_b_c: FloatArray, delay_sigma_s: float) -> FloatArray:
+    def _parted(self, reported: Attitudes, R_b_c: FloatArray, delay_sigma_s: float) -> FloatArray:
         """Deviation about each axis relative to the allowed one ``(3,)``."""
-        found = apart(told, R_b_c, self._config.alignment_sigma_rad)
+        found = apart(reported, R_b_c, self._config.alignment_sigma_rad)
         share = np.clip(_APART_SHARE * found.seen, _APART_RAD, MOST_APART_RAD)
         late = delay_sigma_s * found.rate
         return np.maximum(found.apart / np.hypot(share, late), found.lately / np.hypot(MOST_APART_RAD, 2.0 * late))

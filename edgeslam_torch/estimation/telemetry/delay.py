@@ -75,10 +75,10 @@ class DelaySearch:
             return math.inf
         moved = moved.on_telemetry_clock(delay_s)
         seen = moved.moved @ R_w_m.T
-        told = track.displacement(moved.to_s) - track.displacement(moved.from_s)
-        told, seen = told - told.mean(axis=0), seen - seen.mean(axis=0)
-        scale = float(np.sum(told * seen) / max(float(np.sum(seen**2)), 1e-30))
-        residual = told - max(scale, 0.0) * seen
+        reported = track.displacement(moved.to_s) - track.displacement(moved.from_s)
+        reported, seen = reported - reported.mean(axis=0), seen - seen.mean(axis=0)
+        scale = float(np.sum(reported * seen) / max(float(np.sum(seen**2)), 1e-30))
+        residual = reported - max(scale, 0.0) * seen
         power = np.sort(np.sum(residual**2, axis=1))[: max(3, int(_KEPT * len(residual)))]
         sigma = VELOCITY_M_S * math.sqrt(0.1 * self._config.interval_s)
         cost = 1.5 * len(residual) * math.log(float(power.mean()) / 3.0 + 0.25 * sigma**2)
@@ -91,7 +91,7 @@ class DelaySearch:
         intervals between readings, a bias of 0.04 s at 10 Hz.
         """
         both = turns(moved, track, self._R_b_c)
-        trace = np.einsum("nij,nij->n", both.seen, both.told)
+        trace = np.einsum("nij,nij->n", both.seen, both.reported)
         share = 0.5 * (track.interpolation_variance(moved.from_s) + track.interpolation_variance(moved.to_s))
         squared = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)) ** 2 / share
         kept = np.sort(squared)[: max(3, int(_KEPT * len(trace)))]

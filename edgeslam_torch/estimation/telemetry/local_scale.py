@@ -68,14 +68,14 @@ def scale_of(
     if not len(moved):
         return None
     turned = track.attitude(moved.to_s) - track.attitude(moved.from_s)
-    told = track.displacement(moved.to_s, shortfall_m_s) - track.displacement(moved.from_s, shortfall_m_s)
-    told += turned @ T_b_c[:3, 3]
-    moving = np.linalg.norm(told, axis=1) > config.min_speed_m_s * moved.duration_s
-    moved, told = moved.only(moving), told[moving]
+    reported = track.displacement(moved.to_s, shortfall_m_s) - track.displacement(moved.from_s, shortfall_m_s)
+    reported += turned @ T_b_c[:3, 3]
+    moving = np.linalg.norm(reported, axis=1) > config.min_speed_m_s * moved.duration_s
+    moved, reported = moved.only(moving), reported[moving]
     sigma_m = VELOCITY_M_S * np.sqrt(0.1 * moved.duration_s)
     tilt = config.alignment_sigma_rad
     evidence = displacement_evidence(
-        moved.moved @ R_w_m.T, told, moved.from_s, moved.duration_s, moved.sigma, sigma_m, tilt
+        moved.moved @ R_w_m.T, reported, moved.from_s, moved.duration_s, moved.sigma, sigma_m, tilt
     )
     found = None if evidence is None else solved([evidence], tilt)
     if found is None or found[1] > MOST_SIGMA:

@@ -109,36 +109,36 @@ class Agreement:
 
 
 def agreement(
-    seen: FloatArray, told: FloatArray, least_seen: float, least_told: float, early: bool = False
+    seen: FloatArray, reported: FloatArray, least_seen: float, least_reported: float, early: bool = False
 ) -> Agreement:
     """Correlate visual and telemetry motion interval by interval.
 
     Args:
         seen: ``(N, 1)`` or ``(N, 3)``, in any unit.
-        told: The same shape, in any unit.
+        reported: The same shape, in any unit.
         least_seen: Length below which ``seen`` is noise; infinite if unknown.
-        least_told: The same of ``told``.
+        least_reported: The same of ``reported``.
         early: Whether few intervals may validate an agreement.
 
     Returns:
         The winsorised correlation about the mean over the intervals in which either moves. A common bias or uniform
         motion does not contribute.
     """
-    moving = _moving(seen, least_seen) | (np.linalg.norm(told, axis=1) > least_told)
+    moving = _moving(seen, least_seen) | (np.linalg.norm(reported, axis=1) > least_reported)
     count, dimensions = int(moving.sum()), seen.shape[1]
     if count < 2:
         return Agreement(0.0, count, dimensions, early=early)
-    x, y = _tamed(seen[moving]), _tamed(told[moving])
+    x, y = _tamed(seen[moving]), _tamed(reported[moving])
     varying = _correlation(x - x.mean(axis=0), y - y.mean(axis=0))
     return Agreement(varying, count, dimensions, _correlation(x, y), early)
 
 
-def broken_columns(seen: FloatArray, told: FloatArray) -> tuple[str, ...]:
+def broken_columns(seen: FloatArray, reported: FloatArray) -> tuple[str, ...]:
     """Velocity columns that contradict the images individually.
 
     Args:
         seen: By the images ``(N, 3)`` [map units/s], axes of the columns.
-        told: By telemetry ``(N, 3)`` [m/s].
+        reported: By telemetry ``(N, 3)`` [m/s].
 
     Returns:
         Names of the columns whose residual exceeds the limit at the best scale, without the worst intervals. The mean
@@ -146,10 +146,10 @@ def broken_columns(seen: FloatArray, told: FloatArray) -> tuple[str, ...]:
     """
     if len(seen) < _TO_CONTRADICT:
         return ()
-    scale = max(float(np.sum(told * seen)) / max(float(np.sum(seen**2)), 1e-30), 0.0)
-    left = np.abs(told - scale * seen)
+    scale = max(float(np.sum(reported * seen)) / max(float(np.sum(seen**2)), 1e-30), 0.0)
+    left = np.abs(reported - scale * seen)
     kept = np.sort(left, axis=0)[: int(_KEPT * len(left))]
-    speed = np.sqrt(np.maximum(np.mean(told**2, axis=0), scale**2 * np.mean(seen**2, axis=0)))
+    speed = np.sqrt(np.maximum(np.mean(reported**2, axis=0), scale**2 * np.mean(seen**2, axis=0)))
     apart = np.sqrt(np.mean(kept**2, axis=0)) > np.maximum(_LEFT_OVER * speed, _LEFT_OVER_M_S)
     return tuple(name for name, is_apart in zip(VELOCITY, apart.tolist(), strict=True) if is_apart)
 

@@ -217,8 +217,8 @@ class TelemetryTrack:
 
     def _build(self) -> Readings:
         column = self._rows.column
-        stamp, told, raw_rpy = column("stamp_s"), column("velocity_m_s"), column("rpy_rad")
-        velocity, rpy = _filled(told), np.unwrap(_filled(raw_rpy), axis=0)
+        stamp, reported, raw_rpy = column("stamp_s"), column("velocity_m_s"), column("rpy_rad")
+        velocity, rpy = _filled(reported), np.unwrap(_filled(raw_rpy), axis=0)
         if self._turn is Turn.BACK:
             velocity = self._turn.rotation(rpy).apply(velocity)
         sign = np.sign(np.where(np.abs(velocity) > 1e-6, velocity, 0.0))
@@ -238,9 +238,9 @@ class TelemetryTrack:
             tof=column("tof_m"),
             height=column("height_m"),
             baro=column("baro_m"),
-            has_velocity=_all(np.isfinite(told)),
+            has_velocity=_all(np.isfinite(reported)),
             has_attitude=_known_lately(stamp, _all(np.isfinite(raw_rpy)), self._max_gap_s),
-            frozen=_frozen(stamp, told, raw_rpy),
+            frozen=_frozen(stamp, reported, raw_rpy),
         )
 
     def displacement(self, stamps_s: FloatArray, shortfall_m_s: float = 0.0) -> FloatArray:
@@ -252,10 +252,10 @@ class TelemetryTrack:
         """
         if len(self._samples) < 2:
             return np.zeros((len(stamps_s), 3))
-        told = self.readings
-        stamp = told.stamp_s
-        path = told.path + shortfall_m_s * told.sign_path
-        velocity = told.velocity + shortfall_m_s * told.sign
+        reported = self.readings
+        stamp = reported.stamp_s
+        path = reported.path + shortfall_m_s * reported.sign_path
+        velocity = reported.velocity + shortfall_m_s * reported.sign
         inside = np.clip(stamps_s, stamp[0], stamp[-1])
         beyond = np.clip(np.asarray(stamps_s) - stamp[-1], 0.0, _PACKET_S)  # one packet ahead at the last velocity
         return cubic(stamp, path, velocity, inside) + beyond[:, None] * velocity[-1]
@@ -264,12 +264,12 @@ class TelemetryTrack:
         """Whether every reading of an interval, up to the video's delay before its end, is of a hovering drone."""
         if not self._samples:
             return False
-        told = self.readings
-        first, last = np.searchsorted(told.stamp_s, (from_s, max(from_s, to_s - _LATE_S)))
+        reported = self.readings
+        first, last = np.searchsorted(reported.stamp_s, (from_s, max(from_s, to_s - _LATE_S)))
         if last - first < (to_s - from_s - _LATE_S) / self._max_gap_s or first == last:
             return False
-        still = np.abs(told.velocity[first:last]).max() < _HOVER_M_S  # false for NaN as well
-        return bool(still and np.ptp(told.rpy[first:last], axis=0).max() < _HOVER_RAD)
+        still = np.abs(reported.velocity[first:last]).max() < _HOVER_M_S  # false for NaN as well
+        return bool(still and np.ptp(reported.rpy[first:last], axis=0).max() < _HOVER_RAD)
 
     def copy(self) -> "TelemetryTrack":
         """A copy for another thread."""
@@ -280,8 +280,8 @@ class TelemetryTrack:
 
     def attitude(self, stamps_s: FloatArray) -> FloatArray:
         """Body to power-on world ``(N, 3, 3)``."""
-        told = self.readings
-        rpy = np.stack([np.interp(stamps_s, told.stamp_s, angle) for angle in told.rpy.T], axis=-1)
+        reported = self.readings
+        rpy = np.stack([np.interp(stamps_s, reported.stamp_s, angle) for angle in reported.rpy.T], axis=-1)
         if len(rpy) == 1:
             return matrix_from_rpy(rpy[0])[None]
         return Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
@@ -295,8 +295,8 @@ class TelemetryTrack:
 
     def yaw(self, stamps_s: FloatArray) -> FloatArray:
         """Unwrapped yaw [rad], of the shape of the stamps."""
-        told = self.readings
-        return np.interp(stamps_s, told.stamp_s, told.rpy[:, 2])
+        reported = self.readings
+        return np.interp(stamps_s, reported.stamp_s, reported.rpy[:, 2])
 
     def interpolation_variance(self, stamps_s: FloatArray) -> FloatArray:
         """Variance of `attitude` ``(N,)`` relative to one reading's: 1 at a reading, 1/2 midway between two."""
@@ -337,9 +337,9 @@ class TelemetryTrack:
         if len(self._samples) < 20:
             return 0.0
         stamp = self.readings.stamp_s
-        told = np.array([s.velocity_m_s for s in self._samples], dtype=np.float64)
+        reported = np.array([s.velocity_m_s for s in self._samples], dtype=np.float64)
         log_odds = 0.0
-        for v in np.rint(np.nan_to_num(told) / step_m_s).T:
+        for v in np.rint(np.nan_to_num(reported) / step_m_s).T:
             far = np.flatnonzero(np.abs(v) >= 3)
             for i, j in zip(far[:-1], far[1:], strict=True):
                 if v[i] * v[j] < 0 and j - i > 1 and stamp[j] - stamp[i] < 4.0:
@@ -371,16 +371,16 @@ class TelemetryTrack:
         return self.readings.heights if self._samples else {}
 
 
-def _heights(told: Readings) -> dict[str, tuple[FloatArray, FloatArray]]:
-    lean = np.cos(told.rpy[:, 0]) * np.cos(told.rpy[:, 1])
+def _heights(reported: Readings) -> dict[str, tuple[FloatArray, FloatArray]]:
+    lean = np.cos(reported.rpy[:, 0]) * np.cos(reported.rpy[:, 1])
     sources = {}
-    for name, z in (("tof", told.tof), ("h", told.height), ("baro", told.baro)):
-        good = np.isfinite(z) & ~told.frozen
+    for name, z in (("tof", reported.tof), ("h", reported.height), ("baro", reported.baro)):
+        good = np.isfinite(z) & ~reported.frozen
         if name == "tof":
             # SDK sentinels: 10 cm on the ground, 65.53 m out of range. A leaning drone measures along a slanted ray.
             good &= (z > 0.15) & (z < 8.0) & np.logical_not(lean < _UPRIGHT)
         if good.any():
-            sources[name] = (told.stamp_s[good], z[good])
+            sources[name] = (reported.stamp_s[good], z[good])
     return sources
 
 

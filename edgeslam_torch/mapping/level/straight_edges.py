@@ -130,8 +130,8 @@ def vertical(segments: Segments, R_w_c: FloatArray, focal_sigma: float = 0.0) ->
     best = axes[int(np.where(same, support.along + support.square, -1.0).argmax())]
     share = _support(best[None], segments)
     upward = float(best @ image_up) / max(float(np.linalg.norm(image_up)), 1e-6)
-    told = float(share.along[0] + share.square[0])
-    if told < _LEAST or likely.max() < _ODDS * max(rivals, default=0.0) or upward < _FAR_FROM_UP:
+    explained = float(share.along[0] + share.square[0])
+    if explained < _LEAST or likely.max() < _ODDS * max(rivals, default=0.0) or upward < _FAR_FROM_UP:
         return None
     by_depth = float(share.across[0] / (share.across[0] + _CIRCLES_TELL * share.along[0]))
     sigma = math.hypot(_BUILT_RAD, _DEPTH_RAD * by_depth, _jackknife(best, segments), 0.5 * focal_sigma)
