@@ -273,7 +273,13 @@ class _OnnxEngine:
             from edgeslam_torch.models.onnx.cache import cached_graph
 
             model, self.metadata = cached_graph(path)
-        self._session = open_session(model, path, threads, device)
+        try:
+            self._session = open_session(model, path, threads, device)
+        except WeightsError:
+            if not isinstance(model, Path):
+                raise
+            model.unlink(missing_ok=True)  # a damaged file in the cache
+            self._session = open_session(cached_graph(path)[0], path, threads, device)
         self.device = device_of(self._session)
         height, width = self._session.get_inputs()[0].shape[2:]
         self.fixed_size = (height, width) if isinstance(height, int) and isinstance(width, int) else None

@@ -4,6 +4,7 @@ import shutil
 
 import pytest
 
+from edgeslam_torch.frontend.depth_network import DepthPredictor
 from edgeslam_torch.models.onnx.cache import cached_graph
 from edgeslam_torch.models.onnx.graph import build_graph
 from edgeslam_torch.models.record import DEFAULT_WEIGHTS
@@ -34,3 +35,12 @@ def test_weights_of_the_users_own_leave_nothing(cache, tmp_path):
     shutil.copy(DEFAULT_WEIGHTS, own)
     assert cached_graph(own) == build_graph(own)
     assert not cache.exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"not a network", None], ids=["empty", "other", "truncated"])
+def test_a_damaged_cached_network_is_made_again(cache, content):
+    file, _ = cached_graph(DEFAULT_WEIGHTS)
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2] if content is None else content)
+    DepthPredictor()
+    assert file.read_bytes() == whole
