@@ -56,12 +56,21 @@ class ImuReadings(Record):
         """Whether there are angular rates."""
         return not np.isnan(self.angular_rate_rad_s).all()
 
+    def _magnitudes(self) -> FloatArray:
+        return np.abs(np.concatenate([self.angular_rate_rad_s, self.acceleration_m_s2], axis=1))
+
+    @property
+    def largest(self) -> FloatArray:
+        """Largest magnitude ``(6,)`` of angular rates and accelerations."""
+        return np.abs(np.concatenate([self.angular_rate_rad_s, self.acceleration_m_s2], axis=1)).max(
+            axis=0, initial=0.0
+        )
+
     @property
     def range_ends(self) -> FloatArray:
         """Largest magnitude ``(6,)`` of angular rates and accelerations at which readings are clipped; infinite where
         none are."""
-        ends = np.full(6, np.inf)
-        values = np.abs(np.concatenate([self.angular_rate_rad_s, self.acceleration_m_s2], axis=1))
+        ends, values = np.full(6, np.inf), self._magnitudes()
         for axis in range(0 if self.has_gyroscope else 3, 6) if len(self) >= _CLIPPED else ():
             column, known = values[:, axis], np.unique(values[:, axis])
             first = np.flatnonzero(np.diff(column, prepend=np.nan) != 0.0)

@@ -188,3 +188,22 @@ def test_the_reading_of_a_frame_may_come_with_the_next() -> None:
     seen = flight("free", model, 0)
     seen.readings = seen.readings.between(-np.inf, seen.stamps_s[-1] - 0.004)
     assert fitted(seen, model).scale is not None
+
+
+def test_a_larger_reading_shows_that_the_range_did_not_end_there() -> None:
+    model = mounted(MPU6050, T_IMU_CAM)
+    seen = flight("free", model, 1)
+    t, rate = seen.readings.stamps_s, seen.readings.angular_rate_rad_s.copy()
+    half = t < t[len(t) // 2]
+    end = 0.5 * np.abs(rate[~half, 0]).max()
+    rate[half, 0] = rate[half, 0].clip(-end, end)  # as a slow sensor that repeats its largest reading
+    readings = ImuReadings(t, rate, seen.readings.acceleration_m_s2)
+    middle_s = t[len(t) // 2]
+    imu = Imu(model)
+    imu.add([readings.between(-math.inf, middle_s)])
+    early = seen.stamps_s < middle_s
+    imu.fit(seen.stamps_s[early], seen.T_m_c[early])
+    imu.add([readings.between(middle_s, math.inf)])
+    imu.fit(seen.stamps_s, seen.T_m_c)
+    fastest_s = t[~half][np.abs(rate[~half, 0]).argmax()]
+    assert imu.turned(fastest_s - 0.05, fastest_s + 0.05) is not None

@@ -100,7 +100,8 @@ class Imu:
         if len(stamps_s) < 2:
             return
         readings = self._between(stamps_s[0] - margin_s - 0.1, math.inf)
-        self._range_ends = np.minimum(self._range_ends, readings.range_ends)
+        exceeded = readings.largest > self._range_ends  # what repeated was the largest so far, not the end
+        self._range_ends = np.where(exceeded, readings.range_ends, np.minimum(self._range_ends, readings.range_ends))
         if self._mount is None:
             self._mount = imu_mount(stamps_s, T_m_c[:, :3, :3], readings, self.model)
             if self._mount is None:
