@@ -30,7 +30,7 @@ COMMANDS = {
     "view": ("edgeslam_torch.commands.view", "open a run's report or viewer"),
     "depth": ("edgeslam_torch.commands.depth", "depth maps of images, folders or videos"),
     "finetune": ("edgeslam_torch.commands.training.finetune", "train the depth network on your own recordings"),
-    "distil": ("edgeslam_torch.commands.training.distil", "teach the depth network what a larger one knows"),
+    "distil": ("edgeslam_torch.commands.training.distil", "train the depth network on the predictions of a larger one"),
     "export": ("edgeslam_torch.commands.export", "depth network to ONNX for the companion computer"),
     "weights": ("edgeslam_torch.commands.weights", "list, download, convert and inspect network weights"),
     "record": ("edgeslam_torch.commands.record", "record a flight or a camera"),

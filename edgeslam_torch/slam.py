@@ -249,8 +249,8 @@ class EdgeSlam:
             seen = prepared if prepared is not None else self.prepare(frame)
             system.shows_nothing_new = self._repeats.repeats(seen.grey, frame.stamp_s)
         with system.timed("fusion"):
-            telemetry, felt = separated(readings)
-            system.fusion.add_imu(felt)
+            telemetry, imu_readings = separated(readings)
+            system.fusion.add_imu(imu_readings)
             system.fusion.add_telemetry(telemetry)
             system.has_telemetry = system.has_telemetry or len(telemetry) > 0
         if not self.log.records:
@@ -332,8 +332,8 @@ class EdgeSlam:
         by_edges = up_by_edges(shown, self.edges.hosts, self.camera)
         whole = self.support().whole()
         stamps_s, T_w_c = self.log.poses()
-        felt = up_by_gravity(ImuReadings.joined(system.fusion.imu.forces), self.imu, stamps_s[whole], T_w_c[whole])
-        up = best_known(felt, by_edges)
+        leveled = up_by_gravity(ImuReadings.joined(system.fusion.imu.forces), self.imu, stamps_s[whole], T_w_c[whole])
+        up = best_known(leveled, by_edges)
         if up is None:
             return
         if not system.published.upright:

@@ -44,7 +44,7 @@ def test_readme_shows_commands_that_the_release_runs() -> None:
 
 
 def test_readme_s_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    panels().first(6).write(tmp_path / "tum_fr1_xyz")
+    panels().first(6).write(tmp_path / "recordings" / "tum_fr1_xyz")
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
     names: dict[str, np.ndarray] = {}

@@ -97,7 +97,7 @@ def _record(
     from edgeslam_torch.writers.flight_writer import FlightWriter
 
     folder = args.out or Path("flights") / time.strftime("%Y%m%d-%H%M%S")
-    told = len(source.warnings)
+    printed = len(source.warnings)
     for warning in source.warnings:
         say(f"warning: {warning}")
     failure: EdgeSlamError | None = None
@@ -122,7 +122,7 @@ def _record(
         except EdgeSlamError as error:
             failure = failure or error
         say(f"{writer.frames} frames, {writer.states} state messages in {folder}")
-    for warning in source.warnings[told:]:
+    for warning in source.warnings[printed:]:
         say(f"warning: {warning}")
     for problem in source.problems:
         say(f"note: {problem.file}: {problem.reason}")

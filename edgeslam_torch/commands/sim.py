@@ -85,8 +85,8 @@ def main(args: argparse.Namespace) -> int:
         drone, paint, _ = drone_at(_site(args.world, args.seed), tilt, size, charge)
     drone.air = Air(np.array([0.0, args.wind, 0.0]), 0.5 * args.wind, np.random.default_rng(args.seed))
     drone.battery_per_s = 1.0 / (60.0 * args.drain)
-    told: list[int] = []
-    previous = signal.signal(signal.SIGTERM, lambda number, _: told.append(number))
+    signals: list[int] = []
+    previous = signal.signal(signal.SIGTERM, lambda number, _: signals.append(number))
     try:
         with TelloEmulator(config, paint, drone) as emulator:
             host = args.bind if args.bind != "0.0.0.0" else "this machine's address"
@@ -101,7 +101,7 @@ def main(args: argparse.Namespace) -> int:
                 flush=True,
             )
             end_s = math.inf if args.duration is None else time.monotonic() + args.duration
-            while not told and (left_s := end_s - time.monotonic()) > 0:
+            while not signals and (left_s := end_s - time.monotonic()) > 0:
                 time.sleep(min(left_s, _POLL_S))
     except KeyboardInterrupt:
         return 130

@@ -31,7 +31,7 @@ def fetch(
         names: Names, patterns and sets.
         root: Folder of all recordings.
         agree: Whether the user has agreed before.
-        say: Told licences, sizes and results, line by line.
+        say: Receives licences, sizes and results, line by line.
         archive: A download by hand.
         keep: Keep archives after unpacking.
 

@@ -100,7 +100,7 @@ def get(
         recordings: Of `missing`.
         root: Folder of all recordings.
         progress: Makes the progress of a file's download from its name.
-        say: Told a line for every archive and recording.
+        say: Receives a line for every archive and recording.
         given: An archive that was downloaded by hand, used instead of the address.
         keep: Keep archives.
 

@@ -91,12 +91,12 @@ def watch(pipe: int, commands: socket.socket, drone: tuple[str, int]) -> None:
             if pushed:
                 _send(commands, _CENTRED, drone)
             continue
-        silent_s, heard = 0.0, os.read(pipe, 4096)
-        if not heard:
+        silent_s, received = 0.0, os.read(pipe, 4096)
+        if not received:
             break
-        if heard.endswith(_LANDED):
+        if received.endswith(_LANDED):
             return
-        pushed = heard.endswith(_PUSHED)
+        pushed = received.endswith(_PUSHED)
     land(commands, drone)
 
 

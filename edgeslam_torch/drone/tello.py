@@ -295,7 +295,7 @@ class Tello:
         the state counts as an answer.
 
         Raises:
-            TelloError: If motion is not allowed, the battery is low, the drone refuses, or nothing is heard of it.
+            TelloError: If motion is not allowed, the battery is low, the drone refuses, or it does not answer.
         """
         self._check_motion("takeoff")
         reason = self._unfit()
@@ -319,7 +319,7 @@ class Tello:
                     self._end_flight()
                     raise TelloError(f"{self.address.host}: 'takeoff' was refused: {answer}")
                 if answer is not None:
-                    break  # a refusal of what is repeated: it heard us before and is about to rise
+                    break  # a refusal of what is repeated: it received the command before and is about to rise
             self._wait_for_hover()
 
     def land(self) -> None:

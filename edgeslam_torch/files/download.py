@@ -37,7 +37,7 @@ def fetch(url: str, part: Path, max_bytes: int, progress: Progress | None = None
     Args:
         url: Http or https; https may not lead to anything else.
         part: Grows; its ETag is kept beside it.
-        max_bytes: A server that offers or sends more is not heard.
+        max_bytes: A server that offers or sends more is refused.
         progress: See `Progress`.
 
     Raises:

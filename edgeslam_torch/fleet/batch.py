@@ -27,7 +27,7 @@ def run_batch(
         settings: How.
         out: The batch's folder; one batch at a time.
         runner: `Local`, or one of a cluster.
-        say: Told one line for every flight that ended.
+        say: Receives one line for every flight that ended.
 
     Returns:
         A row for every flight, in their order.

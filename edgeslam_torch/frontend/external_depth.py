@@ -151,14 +151,14 @@ class ExternalDepth:
         known = np.isfinite(given) & np.isfinite(reference.depth_m)
         z = reference.depth_m[known]
         with np.errstate(over="ignore", invalid="ignore"):
-            apart = {
+            deviation = {
                 gives: float(np.nanmedian(np.abs(np.log(_metres(given, gives)[known] / z))))
                 for gives in (Gives.METRES, Gives.LOG_METRES, Gives.INVERSE_METRES)
             }
         if self.network.gives in (Gives.METRES, Gives.LOG_METRES):  # output falls where the reference rises
-            fits = Gives.INVERSE_METRES if apart[Gives.INVERSE_METRES] < SAME_UNIT else Gives.RELATIVE_INVERSE
+            fits = Gives.INVERSE_METRES if deviation[Gives.INVERSE_METRES] < SAME_UNIT else Gives.RELATIVE_INVERSE
         else:
-            fits = Gives.LOG_METRES if apart[Gives.LOG_METRES] < apart[Gives.METRES] else Gives.METRES
+            fits = Gives.LOG_METRES if deviation[Gives.LOG_METRES] < deviation[Gives.METRES] else Gives.METRES
         return f"{self.weights.name} is described as {self.network.gives}, its numbers look like gives = '{fits}'"
 
     def _taken(self, height: int, width: int) -> tuple[int, int]:

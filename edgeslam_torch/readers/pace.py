@@ -40,9 +40,9 @@ class ReadingsCursor:
             self._next += 1
         given: list[Reading] = [*self._samples[first : self._next]]
         if self._imu is not None:
-            felt = self._imu.between(self._until_s, stamp_s + self._ahead_s)
+            measured = self._imu.between(self._until_s, stamp_s + self._ahead_s)
             self._until_s = max(self._until_s, stamp_s + self._ahead_s)
-            given += [felt] if len(felt) else []
+            given += [measured] if len(measured) else []
         return given
 
 
@@ -70,9 +70,9 @@ class Steps:
     def __repr__(self) -> str:
         long = "frames" if self.length is None else f"at most {self.length} frames"
         size = f"{self.camera.width}x{self.camera.height}"
-        told = f"{len(self.telemetry)} telemetry"
-        told += "" if self.imu_readings is None else f", {len(self.imu_readings)} IMU readings"
-        return f"{type(self).__name__}({self.name!r}, {self.kind}, {size}, {long}, {told})"
+        sensors = f"{len(self.telemetry)} telemetry"
+        sensors += "" if self.imu_readings is None else f", {len(self.imu_readings)} IMU readings"
+        return f"{type(self).__name__}({self.name!r}, {self.kind}, {size}, {long}, {sensors})"
 
 
 class Counter:

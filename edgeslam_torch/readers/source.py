@@ -120,8 +120,8 @@ class Recording(Steps):
         if first is None:
             raise SourceError(f"{self.location}: no frame from number {start} on")
         telemetry = [sample for sample in self.telemetry if sample.stamp_s >= first.stamp_s - 1.0]
-        felt = None if self.imu_readings is None else self.imu_readings.between(first.stamp_s - 1.0, math.inf)
-        return replace(self, start=start, stride=stride, length=None, telemetry=telemetry, imu_readings=felt)
+        readings = None if self.imu_readings is None else self.imu_readings.between(first.stamp_s - 1.0, math.inf)
+        return replace(self, start=start, stride=stride, length=None, telemetry=telemetry, imu_readings=readings)
 
     def close(self) -> None:
         """Nothing to release."""
@@ -201,7 +201,7 @@ def open_source(
     folders = [path, content.folder] if path.is_dir() else [content.folder]
     telemetry_file = flight_folder.telemetry_file(folders, telemetry)
     samples, remarks = (list(content.telemetry), []) if telemetry_file is None else read_telemetry(telemetry_file)
-    model, readings, felt = _imu_of(content, folders, imu, imu_model, camera)
+    model, readings, imu_warnings = _imu_of(content, folders, imu, imu_model, camera)
     default = content.default_camera
     chosen, warnings = choose_camera(content.size, camera, folders, default, bool(samples), content.own_camera)
     length = content.length
@@ -217,7 +217,7 @@ def open_source(
         telemetry=samples,
         groundtruth=content.groundtruth,
         problems=content.problems,
-        warnings=[*warnings, *remarks, *felt],
+        warnings=[*warnings, *remarks, *imu_warnings],
         max_frames=max_frames,
         imu=model,
         imu_readings=readings,

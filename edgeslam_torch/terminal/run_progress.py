@@ -62,8 +62,8 @@ class RunProgress(Progress):
         assert output is not None
         silent_s = getattr(source, "silent_s", 0.0)
         waits = f"no picture for {silent_s:.0f} s" if silent_s >= 1.0 else ""
-        told = height_text(source.telemetry[-1]) if source is not None and source.telemetry else ""
-        return ", ".join(part for part in (waits, status_words(output), told, self._path.text(output)) if part)
+        height = height_text(source.telemetry[-1]) if source is not None and source.telemetry else ""
+        return ", ".join(part for part in (waits, status_words(output), height, self._path.text(output)) if part)
 
 
 class PathLength:

@@ -60,8 +60,8 @@ class McapView:
         """Write pose, picture and state; for keyframes also features, and now and then path and map."""
         self._last_s = output.stamp_s
         self._keyframes += output.keyframe
-        felt = [] if self._readings is None else separated(self._readings.until(output.stamp_s))[1]
-        self._guarded(lambda: self._write_imu(felt))
+        imu = [] if self._readings is None else separated(self._readings.until(output.stamp_s))[1]
+        self._guarded(lambda: self._write_imu(imu))
         self._guarded(lambda: self._write_frame(frame, output, slam))
 
     def on_finish(self, slam: "Slam") -> None:
@@ -88,8 +88,8 @@ class McapView:
             logger.warning("%s; the run goes on", self.failure)
 
     def _write_imu(self, parts: Sequence[ImuReadings]) -> None:
-        for felt in parts:
-            for row in zip(felt.stamps_s.tolist(), felt.angular_rate_rad_s, felt.acceleration_m_s2, strict=True):
+        for imu in parts:
+            for row in zip(imu.stamps_s.tolist(), imu.angular_rate_rad_s, imu.acceleration_m_s2, strict=True):
                 self._file.write("/imu", row[0], messages.imu(self._file, *row))
 
     def _write_frame(self, frame: Frame, output: SlamOutput, slam: "Slam") -> None:

@@ -37,11 +37,11 @@ class FlightWriter:
         self.frames = self.states = 0
         self._suffix = "png" if lossless else "jpg"
         self._options = [] if lossless else [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-        held = next((name for name in _FILES if os.path.lexists(folder / name)), None)
-        if held is None and (folder / "rgb").is_dir() and any((folder / "rgb").iterdir()):
-            held = "rgb"
-        if held is not None:
-            raise OutputError(f"{folder}: holds {held} already, of a recording or a run; give another folder")
+        existing = next((name for name in _FILES if os.path.lexists(folder / name)), None)
+        if existing is None and (folder / "rgb").is_dir() and any((folder / "rgb").iterdir()):
+            existing = "rgb"
+        if existing is not None:
+            raise OutputError(f"{folder}: holds {existing} already, of a recording or a run; give another folder")
         try:
             subfolder(folder, "rgb")
             save_camera(folder / "camera.yaml", camera)

@@ -25,10 +25,10 @@ RUNS: dict[str, int] = CASES["release"]
 
 COMMANDS = {
     "demo": "edgeslam demo --out runs/demo",
-    "run": "edgeslam run tum_fr1_xyz --out runs/fr1",
+    "run": "edgeslam run recordings/tum_fr1_xyz --out runs/fr1",
     "fly": "edgeslam fly goto 3 0 --drone sim://l_corridor:3 --fly",
-    "finetune": "edgeslam finetune 7scenes_redkitchen --steps 40 --out tuned",
-    "export": "edgeslam export tuned/weights.safetensors --out model.onnx --int8 --calibrate tum_fr1_rpy_depth",
+    "finetune": "edgeslam finetune recordings/7scenes_redkitchen --steps 40 --out tuned",
+    "export": "edgeslam export tuned/weights.safetensors --out model.onnx --int8 --calibrate recordings/tum_fr1_rpy_depth",
 }
 """Commands whose output the documents show, in this order: later ones use what earlier ones wrote."""
 
@@ -120,10 +120,11 @@ def command_outputs(data: Path, out: Path, commit: str, say: Callable[[str], Non
         EvaluationError: If one fails.
     """
     folder = out / "commands"
-    folder.mkdir(parents=True, exist_ok=True)
+    recordings = folder / "recordings"
+    recordings.mkdir(parents=True, exist_ok=True)
     for name, (recording, _) in find_recordings(data).items():
-        if not (folder / name).exists():
-            (folder / name).symlink_to(recording)
+        if not (recordings / name).exists():
+            (recordings / name).symlink_to(recording)
     kept = folder / "outputs.json"
     found = read_mapping(kept, "JSON", EvaluationError) if kept.is_file() else {}
     if found.get("key") != [commit, COMMANDS]:

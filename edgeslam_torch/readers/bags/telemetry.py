@@ -190,10 +190,10 @@ def _motion_of_twist(
     if attitude is None:
         return None, "velocities without any attitude (Imu, Odometry), so they are not used"
     stamps, velocity = table[:, 0], table[:, 1:4]
-    held = _latest(attitude[0], attitude[1], stamps)
+    attitudes = _latest(attitude[0], attitude[1], stamps)
     if not any(frame.lower().endswith(name) for name in _WORLD_FRAMES):
-        velocity = np.array([matrix_from_rpy(rpy) @ v for rpy, v in zip(held, velocity, strict=True)])
-    return Motion(stamps, velocity, held), None
+        velocity = np.array([matrix_from_rpy(rpy) @ v for rpy, v in zip(attitudes, velocity, strict=True)])
+    return Motion(stamps, velocity, attitudes), None
 
 
 def _latest(stamps: FloatArray, values: FloatArray, at_s: FloatArray) -> FloatArray:

@@ -21,7 +21,7 @@ _NEAR_G = (0.75, 1.35)
 _FASTEST_RAD_S = 70.0
 """4000 deg/s: the largest range of gyroscopes that are sold for drones."""
 _GAP, _GAP_S = 5.0, 0.05
-"""Multiple of the usual interval between readings, and time, beyond which there is a gap."""
+"""Multiple of the median interval between readings, and time, beyond which there is a gap."""
 _EUROC = ((1, 2, 3), (4, 5, 6))
 _GYROSCOPE = re.compile(r"(w|gyr|omega|ang|rot|g(?=[xyz]$)).*[xyz]")
 _ACCELEROMETER = re.compile(r"(a|lin|force|f(?=[xyz]$)).*[xyz]")

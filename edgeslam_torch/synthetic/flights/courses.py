@@ -150,17 +150,17 @@ def record_flight(
     if telemetry is not None:
         floor = world.floor_below(flight.T_w_b[:, :3, 3])
         log = simulate(rng, flight.stamps_s, flight.T_w_c, flight.T_b_c, faults=telemetry, floor_m=floor)
-    felt = None
+    measured = None
     if imu is not None:
         model = mounted(imu, flight.T_b_c)
-        felt = simulate_imu(np.random.default_rng([seed, 59]), flight.stamps_s, flight.T_w_c, model), model
+        measured = simulate_imu(np.random.default_rng([seed, 59]), flight.stamps_s, flight.T_w_c, model), model
     write_flight(
         folder,
         world,
         flight,
         camera,
         telemetry=log,
-        imu=felt,
+        imu=measured,
         faults=faults,
         seed=seed,
         depth_every=DEPTH_EVERY,
