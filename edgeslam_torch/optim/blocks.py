@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.optim.kernels import edges as edge_kernel
 from edgeslam_torch.optim.kernels.normal_equations import accumulate, coupled
+from edgeslam_torch.optim.kernels.reprojection import stepped
 from edgeslam_torch.optim.problem import DepthPriors, EdgeTerms, JunctionTerms, LmConfig, Rows, WindowProblem
 from edgeslam_torch.types import FloatArray, IntArray
 
 Value = TypeVar("Value", bound=np.generic)
 INVERSE_DEPTH_MIN = 1e-4
 """Lower bound of refined inverse depths: practically at infinity, never behind the camera [1/map unit]."""
-LEAST_SHRINKAGE = 0.1
-"""Lower bound of an anchor's inverse distance after a step, relative to that before."""
-_TINY = 1e-12
 _NO_PRIORS = DepthPriors(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
 
 
@@ -119,14 +117,8 @@ class Anchors:
         return Normal(V, g_x, W, cost, (r, front), self.order)
 
     def moved(self, T_c_w: FloatArray, x: FloatArray, step: FloatArray) -> FloatArray:
-        """See `Blocks`; a step is linear in the inverse depth from the first camera that sees the anchor.
-
-        With the point at distance d from that camera, and the step's part a d along the ray, the inverse distance
-        becomes (1 - a) / d. Linear steps of points would overshoot where there is little parallax.
-        """
-        ray = x - se3.inverse(T_c_w)[self.host, :3, 3]
-        along = (step * ray).sum(1) / np.maximum((ray * ray).sum(1), _TINY)
-        return x + step / np.maximum(1.0 - along, LEAST_SHRINKAGE)[:, None]
+        """See `Blocks`."""
+        return stepped(T_c_w, x, self.host, step)
 
 
 class _Seen:

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import lapack
 
-from edgeslam_torch.geometry import se3
 from edgeslam_torch.optim.blocks import Anchors, Blocks, Edges, Junctions, Normal
 from edgeslam_torch.optim.kernels import rows as compiled
 from edgeslam_torch.optim.kernels.normal_equations import back_substitute, eliminate
+from edgeslam_torch.optim.kernels.tangents import stepped
 from edgeslam_torch.optim.levenberg_marquardt import Step, minimise
 from edgeslam_torch.optim.motion_factors import MotionTerms
 from edgeslam_torch.optim.priors import PriorTerms
@@ -82,7 +82,7 @@ class Window:
         """Solve the damped system by eliminating anchors, edge depths and junctions."""
         S, right, factors = self._reduce(system, mu)
         diagonal = system.H.diagonal()
-        S[np.diag_indices_from(S)] += mu * diagonal + _FLOOR
+        np.einsum("ii->i", S)[:] += mu * diagonal + _FLOOR
         delta, sigmas = np.zeros(len(right)), math.inf
         if len(delta):
             # LAPACK is column-major: numpy's upper triangle is its lower one.
@@ -100,10 +100,7 @@ class Window:
             predicted += _promise(mu, _diagonal(normal), normal.g, step)
             size = max(size, _largest(step))
             x.append(block.moved(system.state.T_c_w, was, step))
-        T = system.state.T_c_w.copy()
-        for i, xi in zip(self.free, poses, strict=True):
-            T[i] = se3.exp(xi) @ T[i]
-        return Step(State(T, tuple(x)), predicted, size, sigmas)
+        return Step(State(stepped(system.state.T_c_w, self.free, poses), tuple(x)), predicted, size, sigmas)
 
     def refine(self) -> WindowResult:
         """Run the solver and collect the result."""

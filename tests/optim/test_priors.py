@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.optim.kernels.tangents import stepped
 from edgeslam_torch.optim.priors import PriorTerms, relative_priors
 from edgeslam_torch.optim.problem import RelativePosePrior
 
@@ -67,3 +68,11 @@ def test_the_normal_equations_are_those_of_the_cost(rng):
         assert 2.0 * float(g[k]) == pytest.approx(slope, rel=1e-4, abs=1e-6)
     T[1] = se3.exp(-np.linalg.solve(H, g)) @ T[1]
     assert at(T) < 1e-2 * cost
+
+
+def test_stepped_poses_are_those_of_the_exponential(rng):
+    T, xi = np.stack([pose(rng) for _ in range(4)]), rng.normal(0.0, 1.0, (3, 6))
+    xi[1] *= 1e-5  # the series
+    out = stepped(T, np.array([2, 0, 3]), xi)
+    for i, expected in ((0, se3.exp(xi[1]) @ T[0]), (1, T[1]), (2, se3.exp(xi[0]) @ T[2]), (3, se3.exp(xi[2]) @ T[3])):
+        np.testing.assert_allclose(out[i], expected, atol=1e-12)

@@ -12,6 +12,8 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 MIN_DEPTH = 1e-6
 """Minimum depth of a point in front of the camera [map units]."""
+LEAST_SHRINKAGE = 0.1
+"""Lower bound of an anchor's inverse distance after a step, relative to that before."""
 
 
 @compiled
@@ -95,3 +97,23 @@ def inverse_depth(
         for i in range(3):
             J[o, 0, 6 + i] = slope * T[2, i]
     return r, J, front
+
+
+@compiled
+def stepped(T_c_w: FloatArray, p_w: FloatArray, host: IntArray, step: FloatArray) -> FloatArray:
+    """Anchors ``(A, 3)`` after a step that is linear in their inverse distance from the pose ``host (A,)``.
+
+    With the point at distance d from that camera, and the step's part a d along the ray, the inverse distance becomes
+    (1 - a) / d. Linear steps of points would overshoot where there is little parallax.
+    """
+    out = np.empty(p_w.shape)
+    for n in range(len(p_w)):
+        T, along, square = T_c_w[host[n]], 0.0, 1e-12
+        for i in range(3):
+            ray = p_w[n, i] + T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3]
+            along += step[n, i] * ray
+            square += ray * ray
+        nearer = max(1.0 - along / square, LEAST_SHRINKAGE)
+        for i in range(3):
+            out[n, i] = p_w[n, i] + step[n, i] / nearer
+    return out

@@ -1,11 +1,11 @@
-"""Logarithms of rigid motions with their derivatives, for priors on poses."""
+"""Steps of poses, and logarithms of rigid motions with their derivatives, for priors on poses."""
 
 import math
 
 import numpy as np
 
 from edgeslam_torch.compiled import compiled
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 _SERIES = np.array((-0.5, 1.0 / 12.0, 0.0, -1.0 / 720.0, 0.0, 1.0 / 30240.0))
 """B_n / n! for n = 1..6, of the inverse left Jacobian: for rotations below a radian."""
@@ -74,3 +74,33 @@ def logs(E: FloatArray) -> tuple[FloatArray, FloatArray]:
                     power[i, j] = product[i, j]
                     J[n, i, j] += _SERIES[m] * product[i, j]
     return xi, J
+
+
+@compiled
+def stepped(T: FloatArray, pose: IntArray, xi: FloatArray) -> FloatArray:
+    """Poses ``(W, 4, 4)`` after left tangents ``(n, 6)`` of some ``(n,)`` of them, see `geometry.se3.exp`."""
+    out, E = T.copy(), np.empty((3, 4))
+    for n in range(len(pose)):
+        u, v, w, x, y, z = xi[n]
+        theta2 = x * x + y * y + z * z
+        theta = math.sqrt(theta2)
+        if theta < 1e-3:
+            a = 1.0 - theta2 / 6.0 + theta2 * theta2 / 120.0
+            b = 0.5 - theta2 / 24.0 + theta2 * theta2 / 720.0
+            c = 1.0 / 6.0 - theta2 / 120.0 + theta2 * theta2 / 5040.0
+        else:
+            a, b, c = math.sin(theta) / theta, (1.0 - math.cos(theta)) / theta2, (theta - math.sin(theta)) / theta**3
+        p, q, r = y * w - z * v, z * u - x * w, x * v - y * u
+        along, rest = c * (x * u + y * v + z * w), 1.0 - c * theta2
+        E[0, 0], E[0, 1], E[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
+        E[1, 0], E[1, 1], E[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
+        E[2, 0], E[2, 1], E[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
+        E[0, 3], E[1, 3] = rest * u + b * p + along * x, rest * v + b * q + along * y
+        E[2, 3] = rest * w + b * r + along * z
+        for i in range(3):
+            for j in range(4):
+                total = E[i, 3] if j == 3 else 0.0
+                for k in range(3):
+                    total += E[i, k] * T[pose[n], k, j]
+                out[pose[n], i, j] = total
+    return out
