@@ -4,7 +4,6 @@ import gc
 import os
 import signal
 import zlib
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -17,7 +16,7 @@ settings.register_profile("edgeslam", deadline=None)
 settings.load_profile("edgeslam")
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure(config):
     """Hear signals that whoever started us ignores, as shells do for what runs in the background.
 
     The programs under test would inherit that, and keep ignoring it, as under `nohup`.
@@ -29,20 +28,20 @@ def pytest_configure(config: pytest.Config) -> None:
     gc.disable()  # loading torch and a thousand modules makes no garbage
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_finish():
     """What is loaded stays: the collector need not look at it again and again."""
     gc.freeze()
     gc.enable()
 
 
 @pytest.fixture
-def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+def rng(request):
     """Generator seeded from the test's name: the same numbers whatever runs before it."""
     return np.random.default_rng(zlib.crc32(request.node.name.encode()))
 
 
 @pytest.fixture(scope="session")
-def data_dir() -> Path:
+def data_dir():
     """Folder of the recordings, from the environment variable EDGESLAM_DATA; mark the test ``data``."""
     folder = os.environ.get("EDGESLAM_DATA", "")
     if not folder:
@@ -53,10 +52,10 @@ def data_dir() -> Path:
 
 
 @pytest.fixture
-def write_images(rng: np.random.Generator) -> Callable[..., list[Path]]:
+def write_images(rng):
     """Function that writes small random grey pictures: ``write_images(folder, names, size=(64, 48))``."""
 
-    def write(folder: Path, names: Sequence[str], size: tuple[int, int] = (64, 48)) -> list[Path]:
+    def write(folder, names, size=(64, 48)):
         folder.mkdir(parents=True, exist_ok=True)
         paths = [folder / name for name in names]
         for path in paths:
@@ -68,10 +67,10 @@ def write_images(rng: np.random.Generator) -> Callable[..., list[Path]]:
 
 
 @pytest.fixture
-def write_tum(write_images: Callable[..., list[Path]]) -> Callable[..., Path]:
+def write_tum(write_images):
     """Function that writes a TUM-layout folder with images at 10 Hz: ``write_tum(folder, count)``."""
 
-    def write(folder: Path, count: int, size: tuple[int, int] = (64, 48)) -> Path:
+    def write(folder, count, size=(64, 48)):
         stamps = [100.0 + 0.1 * i for i in range(count)]
         names = [f"rgb/{stamp:.6f}.png" for stamp in stamps]
         write_images(folder, names, size)

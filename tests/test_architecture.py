@@ -3,7 +3,6 @@
 import ast
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -41,13 +40,13 @@ HEAVY = (
 )
 
 
-def sources() -> list[Path]:
+def sources():
     """Every module of the package, each once."""
     files = [p for folder in (PACKAGE, *(ROOT / name for name in LINKED)) for p in folder.rglob("*.py")]
     return sorted({p for p in files if "__pycache__" not in p.parts})
 
 
-def statements(node: ast.AST) -> Iterator[ast.stmt]:
+def statements(node):
     """Statements inside a node at any depth, except for the type checker's own."""
     for inner in ast.iter_child_nodes(node):
         if isinstance(inner, ast.If) and getattr(inner.test, "id", "") == "TYPE_CHECKING":
@@ -58,7 +57,7 @@ def statements(node: ast.AST) -> Iterator[ast.stmt]:
             yield from statements(inner)
 
 
-def imported(nodes: Iterable[ast.AST], known: frozenset[str] = frozenset()) -> Iterator[str]:
+def imported(nodes, known=frozenset()):
     """Full names that statements of a module import.
 
     Args:
@@ -76,7 +75,7 @@ def imported(nodes: Iterable[ast.AST], known: frozenset[str] = frozenset()) -> I
                 yield node.module or ""
 
 
-def forbidden(module: str, names: Iterable[str]) -> list[str]:
+def forbidden(module, names):
     """Imports of a module that the table does not allow."""
     own = part_of(module)
     if own is None:
@@ -85,7 +84,7 @@ def forbidden(module: str, names: Iterable[str]) -> list[str]:
     return [name for name in names if part_of(name) not in {None, own, *allowed}]
 
 
-def module_name(path: Path) -> str:
+def module_name(path):
     """Full module name of a file in the package."""
     folder = PACKAGE if path.is_relative_to(PACKAGE) else ROOT
     return ".".join(("edgeslam_torch", *path.relative_to(folder).with_suffix("").parts)).removesuffix(".__init__")
@@ -95,13 +94,13 @@ MODULES = frozenset(module_name(path) for path in sources())
 
 
 @cache
-def imports() -> dict[str, list[str]]:
+def imports():
     """What each module of the package imports, by its full name."""
     return {module_name(path): list(imported(statements(parsed(path)), MODULES)) for path in sources()}
 
 
 @cache
-def parsed(path: Path) -> ast.Module:
+def parsed(path):
     """Syntax tree of a file."""
     return ast.parse(path.read_text(encoding="utf-8"))
 
@@ -141,7 +140,7 @@ MAX_FILES, MAX_LINES = 15, 2700
 
 
 def test_no_folder_is_too_big():
-    folders: dict[str, list[Path]] = {}
+    folders = {}
     for path in sources():
         folders.setdefault(str(path.parent.relative_to(ROOT)), []).append(path)
     lines = {name: sum(p.read_text(encoding="utf-8").count("\n") for p in files) for name, files in folders.items()}
@@ -157,7 +156,7 @@ def test_packages_that_do_not_belong_are_not_imported():
     assert {name: users[name] for name in LINKED if users[name]} == {}, "import edgeslam_torch.losses, not losses"
 
 
-def loaded_by(statement: str) -> set[str]:
+def loaded_by(statement):
     """Heavy packages that a fresh interpreter has after a statement."""
     code = f"import sys; {statement}; print(' '.join(m for m in {HEAVY!r} if m in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)

@@ -1,7 +1,6 @@
 """Two flights: the second begins in the map that the first has saved."""
 
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -110,7 +109,7 @@ def test_an_atlas_is_loaded_before_the_first_frame():
 
 
 @pytest.fixture
-def recording(tmp_path, write_tum) -> Path:
+def recording(tmp_path, write_tum):
     return write_tum(tmp_path / "recording", 3)
 
 

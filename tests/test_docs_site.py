@@ -7,9 +7,7 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 from browser import PROGRAM, Browser
@@ -37,7 +35,7 @@ ALL_FOUND = """new Promise((done, fail) => {
 })"""
 
 
-def load(name: str) -> ModuleType:
+def load(name):
     sys.path.insert(0, str(BUILDING))
     try:
         return importlib.import_module(name)
@@ -49,7 +47,7 @@ formulas, hooks, reference = load("formulas"), load("hooks"), load("reference")
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory):
     """As ``make docs`` makes it; strict: a link or an anchor that leads nowhere ends it."""
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "-q", "-d", str(folder)]
@@ -58,21 +56,21 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def browser(tmp_path_factory):
     if PROGRAM is None:
         pytest.skip("no chromium here: the pages are not opened")
     with Browser(tmp_path_factory.mktemp("profile")) as started:
         yield started
 
 
-def pages(site: Path) -> list[Path]:
+def pages(site):
     return sorted(page for page in site.rglob("*.html") if page.name != "404.html")
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("width", [360, 1280])
-def test_no_page_scrolls_sideways_or_logs_an_error(site: Path, browser: Browser, width: int) -> None:
+def test_no_page_scrolls_sideways_or_logs_an_error(site, browser, width):
     wide = {}
     for page in pages(site):
         browser.open(page, width=width, height=844, mobile=width < 700)
@@ -83,7 +81,7 @@ def test_no_page_scrolls_sideways_or_logs_an_error(site: Path, browser: Browser,
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_search_finds_without_server_and_network(site: Path, browser: Browser) -> None:
+def test_search_finds_without_server_and_network(site, browser):
     browser.open(site / "index.html", width=1280, height=844, mobile=False)
     assert re.search(r"(start|guides|theory)/[\w-]+\.html", browser.run(ALL_FOUND)[0]), "guides come first"
     assert browser.errors == []
@@ -91,7 +89,7 @@ def test_search_finds_without_server_and_network(site: Path, browser: Browser) -
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_formulas_are_set_without_a_network(site: Path, browser: Browser) -> None:
+def test_formulas_are_set_without_a_network(site, browser):
     page = max(pages(site), key=lambda path: path.read_text(encoding="utf-8").count("<math"))
     browser.open(page, width=390, height=844, mobile=True)
     sizes = browser.run("[...document.querySelectorAll('math')].map(m => m.getBoundingClientRect().height)")
@@ -103,7 +101,7 @@ def test_formulas_are_set_without_a_network(site: Path, browser: Browser) -> Non
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_the_reference_has_what_guides_and_examples_import(site: Path) -> None:
+def test_the_reference_has_what_guides_and_examples_import(site):
     shown = {
         anchor.rpartition(".")[2]
         for page in (site / "reference" / "api").glob("*.html")
@@ -112,7 +110,7 @@ def test_the_reference_has_what_guides_and_examples_import(site: Path) -> None:
     assert imported_names() - shown == set()
 
 
-def imported_names() -> set[str]:
+def imported_names():
     """Names of the package that code in guides, README and examples imports."""
     guides_ = [ROOT / "README.md", *(ROOT / "docs").glob("start/*.md"), *(ROOT / "docs").glob("guides/*.md")]
     code = [path.read_text(encoding="utf-8") for path in (ROOT / "examples").glob("*.py")]
@@ -122,7 +120,7 @@ def imported_names() -> set[str]:
     return {name.name for node in found if (node.module or "").startswith("edgeslam_torch") for name in node.names}
 
 
-def test_every_setting_has_its_default_and_its_reason() -> None:
+def test_every_setting_has_its_default_and_its_reason():
     rows = re.findall(r"^\| `(\w+)` \| `([^`]+)`[^|]* \| (.+) \|$", reference.settings_page(), re.MULTILINE)
     config = tomllib.loads(to_toml(SlamConfig()))
     flat = [
@@ -134,14 +132,14 @@ def test_every_setting_has_its_default_and_its_reason() -> None:
     assert {(key, json.dumps(value)) for key, value in flat if isinstance(value, (bool, int, str))} <= defaults
 
 
-def test_every_command_and_option_is_in_the_reference() -> None:
+def test_every_command_and_option_is_in_the_reference():
     page = reference.commands_page()
     assert [name for name in COMMANDS if f"\n## edgeslam {name}\n" not in page] == []
     options = subprocess.run([sys.executable, "-m", "edgeslam_torch.cli", "run", "-h"], capture_output=True, text=True)
     assert set(re.findall(r"--[a-z][\w-]+", options.stdout)) - {"--help"} <= set(re.findall(r"--[a-z][\w-]+", page))
 
 
-def test_formulas_keep_their_place_in_a_docstring() -> None:
+def test_formulas_keep_their_place_in_a_docstring():
     text = "Model:\n\n    .. math::\n        a_i = b,\n        \\quad c\n\n    with :math:`\\log s` known.\n"
     found = formulas.formulas_as_mathml(text)
     assert found.startswith('Model:\n\n    <span class="formula"><math ')
@@ -150,23 +148,23 @@ def test_formulas_keep_their_place_in_a_docstring() -> None:
     assert "<mi>log</mi><mspace" in found
 
 
-def test_formula_at_the_start_of_a_line_does_not_split_its_paragraph() -> None:
+def test_formula_at_the_start_of_a_line_does_not_split_its_paragraph():
     markdown = pytest.importorskip("markdown")
     text = formulas.formulas_as_mathml("A height above\n:math:`h + c`, which is unknown.\n")
     assert markdown.markdown(text, extensions=["md_in_html"]).count("<p>") == 1
 
 
-def test_formulas_of_a_page_are_set() -> None:
+def test_formulas_of_a_page_are_set():
     found = formulas.fenced_as_mathml("Before.\n\n```math\n\\frac{a}{b}\n```\n\n```\nmath\n```\n")
     assert found.count("<math") == 1 and "```math" not in found and "```\nmath\n```" in found
 
 
-def test_formula_that_cannot_be_set_is_an_error() -> None:
+def test_formula_that_cannot_be_set_is_an_error():
     with pytest.raises(ValueError, match=r"does not know: \\nosuch"):
         formulas.mathml(r"\nosuch{x}", "inline")
 
 
-def test_what_a_page_would_load_is_found(tmp_path: Path) -> None:
+def test_what_a_page_would_load_is_found(tmp_path):
     (tmp_path / "a.html").write_text('<script async src="https://cdn.example/x.js"></script><a href="https://ok">x</a>')
     (tmp_path / "b.html").write_text('<img src="pictures/x.png"><link rel=stylesheet href=//cdn.example/x.css>')
     assert hooks.network_needs(tmp_path) == [
@@ -187,11 +185,11 @@ def test_what_a_page_would_load_is_found(tmp_path: Path) -> None:
         ("nosuch.md", "guides/tello.md", "nosuch.md"),
     ],
 )
-def test_links_of_the_repository_become_links_of_the_site(link: str, uri: str, page: str) -> None:
+def test_links_of_the_repository_become_links_of_the_site(link, uri, page):
     assert hooks.turned(link, uri, hooks.home(uri)) == page
 
 
-def test_notebook_becomes_a_page(tmp_path: Path) -> None:
+def test_notebook_becomes_a_page(tmp_path):
     path = tmp_path / "book.ipynb"
     path.write_text(
         '{"cells": [{"cell_type": "markdown", "source": ["# Title\\n", "words"]}, {"cell_type": "code", '

@@ -25,7 +25,7 @@ TAKES_WEIGHTS = {"finetune", "distil"}
 """Commands that refuse weights which are not there; of them the options alone are compared."""
 
 
-def commands() -> list[tuple[str, str]]:
+def commands():
     """Page and line of each command in a block of code."""
     return [
         (page.name, line)
@@ -36,7 +36,7 @@ def commands() -> list[tuple[str, str]]:
     ]
 
 
-def test_every_command_is_one_that_the_program_takes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_is_one_that_the_program_takes(capsys):
     parser, wrong = full_parser(cli.available()), []
     for page, line in commands():
         words = [word for word in shlex.split(line, comments=True)[1:] if word != "..."]
@@ -52,11 +52,11 @@ def test_every_command_is_one_that_the_program_takes(capsys: pytest.CaptureFixtu
     assert wrong == [] and len(commands()) > 40
 
 
-def option_names(command: str) -> set[str]:
+def option_names(command):
     return set(re.findall(r"--[a-z][\w-]*", commands_page().split(f"\n## edgeslam {command}\n")[1].split("\n## ")[0]))
 
 
-def imports() -> set[tuple[str, str]]:
+def imports():
     """Module and name of what Python code in the documents imports from the package."""
     blocks = [
         block
@@ -69,11 +69,11 @@ def imports() -> set[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("module", "name"), sorted(imports()))
-def test_every_import_exists(module: str, name: str) -> None:
+def test_every_import_exists(module, name):
     assert hasattr(importlib.import_module(module), name)
 
 
-def test_no_link_between_documents_is_broken() -> None:
+def test_no_link_between_documents_is_broken():
     pages = ("reference/settings.md", "reference/commands.md", *api_pages())
     generated, broken = {ROOT / "docs" / page for page in pages}, []
     for page in DOCS:
@@ -86,7 +86,7 @@ def test_no_link_between_documents_is_broken() -> None:
 
 
 @pytest.mark.parametrize("page", sorted((ROOT / "docs" / "theory").glob("*.md")), ids=lambda path: path.stem)
-def test_what_the_theory_names_exists(page: Path) -> None:
+def test_what_the_theory_names_exists(page):
     text = page.read_text(encoding="utf-8")
     for name in re.findall(r"`(edgeslam_torch(?:\.\w+)+)`", text):
         assert resolve_name(name)

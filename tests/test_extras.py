@@ -18,13 +18,13 @@ IMPORTED_AS = {"opencv-python-headless": "cv2", "PyYAML": "yaml", "rerun-sdk": "
 """Import names that differ from the package's."""
 
 
-def import_names(requirements: list[str]) -> set[str]:
+def import_names(requirements):
     """What requirements are imported as."""
     names = [match[0] for text in requirements if (match := re.match(r"[\w.-]+", text))]
     return {IMPORTED_AS.get(name, name.replace("-", "_")) for name in names}
 
 
-def test_missing_package_is_named_with_its_extra() -> None:
+def test_missing_package_is_named_with_its_extra():
     with (
         pytest.raises(MissingPackageError, match=r"^--plots needs nosuch: pip install 'edgeslam-torch\[plots\]'$"),
         needs_extra("plots", "--plots"),
@@ -32,7 +32,7 @@ def test_missing_package_is_named_with_its_extra() -> None:
         import nosuch  # noqa: F401
 
 
-def test_missing_module_of_our_own_is_a_bug() -> None:
+def test_missing_module_of_our_own_is_a_bug():
     with pytest.raises(ModuleNotFoundError), needs_extra("plots", "--plots"):
         import edgeslam_torch.nosuch  # noqa: F401
 
@@ -52,21 +52,21 @@ sys.exit(main({arguments}))
 """
 
 
-def edgeslam_without_extras(*arguments: str) -> subprocess.CompletedProcess[str]:
+def edgeslam_without_extras(*arguments):
     """The command line as a plain ``pip install .`` has it."""
     absent = set().union(*map(import_names, EXTRAS.values()))
     code = IN_AN_ENVIRONMENT_WITHOUT.format(absent=sorted(absent), arguments=list(arguments))
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
-def test_export_without_its_extra_says_so_in_one_line(tmp_path: Path) -> None:
+def test_export_without_its_extra_says_so_in_one_line(tmp_path):
     done = edgeslam_without_extras("export", "--out", str(tmp_path / "model.onnx"))
     assert done.returncode == 1
     assert done.stderr == "edgeslam: error: edgeslam export needs onnxscript: pip install 'edgeslam-torch[export]'\n"
 
 
 @pytest.mark.slow
-def test_demo_needs_no_extra(tmp_path: Path) -> None:
+def test_demo_needs_no_extra(tmp_path):
     done = edgeslam_without_extras("demo", "--seconds", "5", "--out", str(tmp_path / "demo"))
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "demo" / "report.html").is_file()

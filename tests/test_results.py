@@ -4,9 +4,7 @@ import importlib.util
 import re
 import shlex
 from pathlib import Path
-from types import ModuleType
 
-import numpy as np
 import pytest
 from rendered import panels
 
@@ -18,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
 
 
-def load(path: Path) -> ModuleType:
+def load(path):
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -30,29 +28,29 @@ results_pages = load(ROOT / "docs" / "building" / "results_pages.py")
 
 
 @pytest.mark.parametrize("page", results_pages.PAGES, ids=lambda page: page.name)
-def test_page_is_what_the_release_gives(page: Path) -> None:
+def test_page_is_what_the_release_gives(page):
     text = page.read_text(encoding="utf-8")
     again = results_pages.rewritten(text, results_pages.current())
     assert text == again, f"run: python {Path(results_pages.__file__).relative_to(ROOT)}"
     assert "<!-- results:" in text
 
 
-def test_readme_shows_commands_that_the_release_runs() -> None:
+def test_readme_shows_commands_that_the_release_runs():
     shown = re.findall(r"^\$ (.+)$", README.read_text(encoding="utf-8"), re.MULTILINE)
     assert sorted(shown) == sorted(release.COMMANDS.values())
     assert all(shlex.split(command)[0] == "edgeslam" for command in shown)
 
 
-def test_readme_s_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readme_s_python_runs(tmp_path, monkeypatch):
     panels().first(6).write(tmp_path / "recordings" / "tum_fr1_xyz")
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    names: dict[str, np.ndarray] = {}
+    names = {}
     exec(code, names)
     assert names["T_w_c"].shape == (6, 4, 4) and names["points"].shape[1] == 3
 
 
-def rows(**changes: str) -> list[dict]:
+def rows(**changes):
     """Every run of a release; figures are the seed."""
     figures = [dict.fromkeys((*FIGURES, "took_s"), float(seed)) for seed in range(max(RUNS.values()))]
     return [
@@ -62,7 +60,7 @@ def rows(**changes: str) -> list[dict]:
     ]
 
 
-def test_release_holds_median_and_range_of_every_figure() -> None:
+def test_release_holds_median_and_range_of_every_figure():
     found = release_record(rows(), "abc", {})
     assert found["commit"] == "abc" and set(found["runs"]) == set(RUNS)
     assert found["runs"]["tum_fr1_xyz"]["ate_m"] == [1.0, 0.0, 2.0]
@@ -78,6 +76,6 @@ def test_release_holds_median_and_range_of_every_figure() -> None:
         ("abc", rows()[1:], "2 of 3 runs"),
     ],
 )
-def test_release_that_nobody_can_repeat_is_refused(commit: str, broken: list[dict], words: str) -> None:
+def test_release_that_nobody_can_repeat_is_refused(commit, broken, words):
     with pytest.raises(EvaluationError, match=re.escape(words)):
         release_record(broken, commit, {})

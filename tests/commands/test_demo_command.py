@@ -1,7 +1,6 @@
 """``edgeslam demo``."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +12,7 @@ from edgeslam_torch.readers.source import open_source
 
 
 @pytest.mark.parametrize("world", ["room", "corridor"])
-def test_record_only_leaves_a_recording_that_can_be_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], world: str
-) -> None:
+def test_record_only_leaves_a_recording_that_can_be_run(tmp_path, capsys, world):
     assert (
         main(["demo", "--out", str(tmp_path), "--world", world, "--duration", "1", "--rate", "5", "--record-only"]) == 0
     )
@@ -28,7 +25,7 @@ def test_record_only_leaves_a_recording_that_can_be_run(
     assert "edgeslam run" in capsys.readouterr().out
 
 
-def test_many_recordings_have_different_places_and_are_not_made_again(tmp_path: Path) -> None:
+def test_many_recordings_have_different_places_and_are_not_made_again(tmp_path):
     options = ["--world", "corridor", "--duration", "1", "--rate", "5", "--width", "160", "--seed", "3"]
     assert main(["demo", "--out", str(tmp_path), "--record-only", "--flights", "2", *options]) == 0
     images = [open_source(str(tmp_path / f"flight_000{i}")).frames() for i in (3, 4)]
@@ -41,13 +38,13 @@ def test_many_recordings_have_different_places_and_are_not_made_again(tmp_path: 
     assert (tmp_path / "flight_0005" / "rgb.txt").is_file()
 
 
-def test_shorter_demo_leaves_nothing_of_the_longer_one(tmp_path: Path) -> None:
+def test_shorter_demo_leaves_nothing_of_the_longer_one(tmp_path):
     for seconds in (2.0, 1.0):
         record(tmp_path, DemoSettings(world="corridor", seconds=seconds, rate_hz=5.0, width=160, height=120))
     assert len(list((tmp_path / "rgb").iterdir())) == 5
 
 
-def test_a_demo_clears_no_recording_of_somebody_else(tmp_path: Path) -> None:
+def test_a_demo_clears_no_recording_of_somebody_else(tmp_path):
     (tmp_path / "rgb").mkdir()
     (tmp_path / "rgb" / "1.0.png").write_text("theirs")
     with pytest.raises(OutputError, match="--out"):
@@ -56,7 +53,7 @@ def test_a_demo_clears_no_recording_of_somebody_else(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_demo_runs_and_judges_itself(tmp_path: Path) -> None:
+def test_demo_runs_and_judges_itself(tmp_path):
     settings = DemoSettings(seconds=6.0, rate_hz=12.0, width=320, height=240)
     recorded = record(tmp_path / "flight", settings)
     demo = run_and_judge(tmp_path, recorded, settings)
@@ -81,11 +78,8 @@ def test_demo_runs_and_judges_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("world", "scale_bar", "ate_bar"),
-    [("room", 0.02, 0.01), ("corridor", 0.02, 0.01)],
-)
-def test_demo_flight_meets_its_bars(tmp_path: Path, world: str, scale_bar: float, ate_bar: float) -> None:
+@pytest.mark.parametrize(("world", "scale_bar", "ate_bar"), [("room", 0.02, 0.01), ("corridor", 0.02, 0.01)])
+def test_demo_flight_meets_its_bars(tmp_path, world, scale_bar, ate_bar):
     settings = DemoSettings(world=world)
     demo = run_and_judge(tmp_path, record(tmp_path / "flight", settings), settings)
     assert demo.score.coverage > 0.99
@@ -107,9 +101,7 @@ def test_demo_flight_meets_its_bars(tmp_path: Path, world: str, scale_bar: float
         (["--width", "641"], "--width must be"),
     ],
 )
-def test_wrong_options_are_told_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
+def test_wrong_options_are_told_in_one_line(tmp_path, capsys, arguments, message):
     assert main(["demo", "--out", str(tmp_path), *arguments]) == 1
     error = capsys.readouterr().err.strip()
     assert message in error

@@ -31,16 +31,15 @@ METADATA = Metadata(input_height=96, input_width=128, focal_px=105.0)
 SMALL = Widths((8, 16) + (24,) * 12, (24, 24, 24, 16, 16))
 
 
-def run(command: str, *args: str | Path) -> int:
+def run(command, *args):
     module = importlib.import_module(f"edgeslam_torch.commands.{command}")
     parser = argparse.ArgumentParser()
     module.add_arguments(parser)
-    code: int = module.main(parser.parse_args([str(a) for a in args]))
-    return code
+    return module.main(parser.parse_args([str(a) for a in args]))
 
 
 @pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def weights(tmp_path_factory):
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
     save_checkpoint(build_network(METADATA, SMALL).eval(), METADATA, path)
@@ -48,7 +47,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def pictures(tmp_path: Path, rng: np.random.Generator) -> Path:
+def pictures(tmp_path, rng):
     folder = tmp_path / "pictures"
     folder.mkdir()
     for k in range(10):
@@ -58,9 +57,7 @@ def pictures(tmp_path: Path, rng: np.random.Generator) -> Path:
     return folder
 
 
-def test_depth_names_the_images_that_it_left_out(
-    weights: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_depth_names_the_images_that_it_left_out(weights, pictures, tmp_path, capsys):
     (pictures / "img1.png").write_bytes(b"\x89PNG")
     assert run("depth", pictures, "--out", tmp_path / "out", "--weights", weights, "--max-frames", "3") == 0
     said = capsys.readouterr().out
@@ -68,7 +65,7 @@ def test_depth_names_the_images_that_it_left_out(
     assert "img1.png: " in said
 
 
-def test_depth_of_a_folder(weights: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_depth_of_a_folder(weights, pictures, tmp_path, capsys):
     out = tmp_path / "out"
     assert run("depth", pictures, "--out", out, "--weights", weights, "--sigma", "--max-frames", "3") == 0
     assert "3 depth maps" in capsys.readouterr().out
@@ -82,14 +79,14 @@ def test_depth_of_a_folder(weights: Path, pictures: Path, tmp_path: Path, capsys
     assert cv2.imread(str(out / "img1_colour.png")).shape == (150, 160, 3)  # the bar below has 30 rows
 
 
-def test_depth_maps_never_take_the_images_place(weights: Path, pictures: Path) -> None:
+def test_depth_maps_never_take_the_images_place(weights, pictures):
     before = {p.name: p.read_bytes() for p in pictures.iterdir()}
     with pytest.raises(EdgeSlamError, match="holds the images themselves"):
         run("depth", pictures, "--out", pictures, "--weights", weights)
     assert {p.name: p.read_bytes() for p in pictures.iterdir()} == before
 
 
-def test_two_images_of_one_name_are_two_depth_maps(weights: Path, pictures: Path, tmp_path: Path) -> None:
+def test_two_images_of_one_name_are_two_depth_maps(weights, pictures, tmp_path):
     for old in pictures.glob("*.png"):
         if old.name != "img0.png":
             old.unlink()
@@ -100,10 +97,8 @@ def test_two_images_of_one_name_are_two_depth_maps(weights: Path, pictures: Path
     assert not np.array_equal(np.load(maps[0]), np.load(maps[1]))
 
 
-def test_depth_maps_that_cannot_be_meant_are_unknown_and_counted(
-    weights: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def far(self: DepthPredictor, image: np.ndarray, camera: Camera) -> DepthMap:
+def test_depth_maps_that_cannot_be_meant_are_unknown_and_counted(weights, pictures, tmp_path, capsys, monkeypatch):
+    def far(self, image, camera):
         return DepthMap(np.full(image.shape[:2], 1e30, np.float32), np.ones(image.shape[:2], np.float32))
 
     monkeypatch.setattr(DepthPredictor, "__call__", far)
@@ -115,14 +110,14 @@ def test_depth_maps_that_cannot_be_meant_are_unknown_and_counted(
 
 @pytest.mark.parametrize("option", ["--threads", "--max-frames"])
 @pytest.mark.parametrize("value", ["0", "-3", "1.5", "many", "9" * 30, "٣"])
-def test_counts_must_be_whole_and_positive(option: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_counts_must_be_whole_and_positive(option, value, capsys):
     with pytest.raises(SystemExit) as ended:
         run("depth", "x", "--out", "y", f"{option}={value}")
     assert ended.value.code == 2
     assert "at least 1" in capsys.readouterr().err
 
 
-def test_depth_of_one_image_uses_the_camera_beside_it(weights: Path, pictures: Path, tmp_path: Path) -> None:
+def test_depth_of_one_image_uses_the_camera_beside_it(weights, pictures, tmp_path):
     run("depth", pictures / "img2.png", "--out", tmp_path / "a", "--weights", weights)
     run("depth", pictures / "img2.png", "--out", tmp_path / "b", "--weights", weights, "--camera", "kinect")
     a, b = np.load(tmp_path / "a" / "img2.npy"), np.load(tmp_path / "b" / "img2.npy")
@@ -130,9 +125,7 @@ def test_depth_of_one_image_uses_the_camera_beside_it(weights: Path, pictures: P
 
 
 @pytest.mark.slow
-def test_int8_export_is_checked_and_runs_on_the_companion_example(
-    weights: Path, pictures: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_int8_export_is_checked_and_runs_on_the_companion_example(weights, pictures, tmp_path, capfd):
     out = tmp_path / "depth.onnx"
     code = run(
         "export",
@@ -166,7 +159,7 @@ def test_int8_export_is_checked_and_runs_on_the_companion_example(
     assert float(printed.split()[2]) == pytest.approx(float(z[58:63, 78:83].mean()), rel=0.05)
 
 
-def test_export_refuses_what_makes_no_sense(weights: Path, tmp_path: Path) -> None:
+def test_export_refuses_what_makes_no_sense(weights, tmp_path):
     with pytest.raises(ConfigError, match="--calibrate"):
         run("export", weights, "--out", tmp_path / "x.onnx", "--int8")
     with pytest.raises(ConfigError, match="multiples of 32"):
@@ -181,16 +174,14 @@ def test_export_refuses_what_makes_no_sense(weights: Path, tmp_path: Path) -> No
     assert not (tmp_path / "x.onnx").exists()
 
 
-def test_int8_export_needs_enough_pictures(weights: Path, pictures: Path, tmp_path: Path) -> None:
+def test_int8_export_needs_enough_pictures(weights, pictures, tmp_path):
     for k in range(5):
         (pictures / f"img{k}.png").unlink()
     with pytest.raises(ConfigError, match="--int8 needs 8 images, there are 5"):
         run("export", weights, "--out", tmp_path / "x.onnx", "--int8", "--calibrate", pictures)
 
 
-def test_weights_list_inspect_convert(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_weights_list_inspect_convert(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path / "cache"))
     run("weights", "list")
     listed = capsys.readouterr().out
@@ -209,13 +200,11 @@ def test_weights_list_inspect_convert(
         run("weights", "download", "resnet")
 
 
-def test_download_says_how_far_a_file_can_be_trusted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_download_says_how_far_a_file_can_be_trusted(tmp_path, capsys, monkeypatch):
     """First, again, changed: with a file in the server's place."""
     from edgeslam_torch.models import download as module
 
-    def fetch(url: str, part: Path, max_bytes: int, progress: object) -> None:
+    def fetch(url, part, max_bytes, progress):
         part.write_bytes(content)
 
     torch.save(FastDepth(Variant.PRUNED).state_dict(), tmp_path / "plain.pth")
@@ -232,7 +221,7 @@ def test_download_says_how_far_a_file_can_be_trusted(
         run("weights", "download", name)
 
 
-def test_a_download_that_is_no_network_is_not_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_download_that_is_no_network_is_not_remembered(tmp_path, monkeypatch):
     from edgeslam_torch.models import download as module
 
     monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path))
@@ -242,9 +231,7 @@ def test_a_download_that_is_no_network_is_not_remembered(tmp_path: Path, monkeyp
     assert not list(tmp_path.glob("*.sha256"))
 
 
-def test_inspect_reads_exported_files_and_shows_no_control_characters(
-    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_inspect_reads_exported_files_and_shows_no_control_characters(weights, tmp_path, capsys):
     network, metadata = load_checkpoint(weights)
     loud = replace(metadata, notes="red \x1b[31m\nlicence: free", input_height=2048, input_width=2048, focal_px=1000.0)
     save_checkpoint(network, loud, tmp_path / "loud.safetensors")
@@ -258,22 +245,20 @@ def test_inspect_reads_exported_files_and_shows_no_control_characters(
 # -- networks of others --------------------------------------------------------------------------------------------
 
 
-def test_depth_maps_of_a_relative_network_would_have_no_unit(pictures: Path, tmp_path: Path) -> None:
+def test_depth_maps_of_a_relative_network_would_have_no_unit(pictures, tmp_path):
     network = describe(green_network(tmp_path / "n.onnx", **RELATIVE), 'preset = "midas-small"\n')
     with pytest.raises(ConfigError, match="up to scale and shift"):
         run("depth", pictures, "--out", tmp_path / "out", "--weights", network)
 
 
-def test_network_of_others_is_inspected_by_its_description(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_network_of_others_is_inspected_by_its_description(tmp_path, capsys):
     network = describe(green_network(tmp_path / "n.onnx"), 'preset = "metric3d-v2-small"\ndepth = ""\n')
     assert run("weights", "inspect", network) == 0
     said = capsys.readouterr().out
     assert "gives: metres" in said and "focal_px: 1000.0" in said
 
 
-def test_downloaded_network_is_ready_to_use(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_downloaded_network_is_ready_to_use(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path / "cache"))
     published = green_network(tmp_path / "published.onnx", **RELATIVE, input="0", size=(256, 256), plane=True)
     preset = PRESETS["midas-small"]
@@ -289,9 +274,7 @@ def test_downloaded_network_is_ready_to_use(
         run("weights", "download", "midas-small")
 
 
-def test_a_missing_device_is_said_before_anything_is_written(
-    weights: Path, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_device_is_said_before_anything_is_written(weights, pictures, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     out = tmp_path / "out"
     for words in (("depth", pictures, "--weights", weights), ("run", pictures, "--depth", weights)):

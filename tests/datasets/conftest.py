@@ -2,7 +2,6 @@
 
 import hashlib
 import threading
-from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
@@ -11,18 +10,18 @@ import pytest
 class Publisher:
     """Serves ``files`` by path, with ranges and ETags; ``requests`` has the path and range of each request."""
 
-    def __init__(self) -> None:
-        self.files: dict[str, bytes] = {}
-        self.requests: list[tuple[str, str]] = []
-        self.breaks: dict[str, int] = {}
+    def __init__(self):
+        self.files = {}
+        self.requests = []
+        self.breaks = {}
         """Bytes after which the next answer for a path breaks off."""
-        self.redirects: dict[str, str] = {}
-        self.agents: set[str] = set()
+        self.redirects = {}
+        self.agents = set()
         self.has_ranges = True
         publisher = self
 
         class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
+            def do_GET(self):
                 asked = self.headers.get("Range") or ""
                 publisher.requests.append((self.path, asked))
                 publisher.agents.add(self.headers.get("User-Agent") or "")
@@ -51,20 +50,20 @@ class Publisher:
                 end = publisher.breaks.pop(self.path, len(content))
                 self.wfile.write(content[start:end])
 
-            def log_message(self, *_: object) -> None:
+            def log_message(self, *_):
                 """Quiet."""
 
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         threading.Thread(target=self._server.serve_forever, args=(0.01,), daemon=True).start()
         self.address = f"http://127.0.0.1:{self._server.server_port}"
 
-    def stop(self) -> None:
+    def stop(self):
         self._server.shutdown()
         self._server.server_close()
 
 
 @pytest.fixture
-def publisher() -> Iterator[Publisher]:
+def publisher():
     started = Publisher()
     yield started
     started.stop()

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from readme_recordings import archives
@@ -14,7 +13,7 @@ FRAMES = 60
 """Of each recording: two to six seconds."""
 
 
-def publish(publisher, data: Path, frames: int) -> dict[str, catalogue.Recording]:
+def publish(publisher, data, frames):
     """The catalogue's recordings with this publisher's addresses, whose archives are shorter than the real ones."""
     recordings = dict(catalogue.read_catalogue()[0])
     for name, content in archives(data, frames):

@@ -2,8 +2,6 @@
 
 import csv
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,7 +17,7 @@ COLUMNS = (
 )
 
 
-def loop_trajectory(count: int = 200, rate_hz: float = 20.0, begin_s: float = 100.0) -> Trajectory:
+def loop_trajectory(count=200, rate_hz=20.0, begin_s=100.0):
     """A camera on a rising wave inside a room, looking outwards and turning."""
     t = np.arange(count) / rate_hz
     yaw = 0.6 * np.sin(0.9 * t) + 0.35 * t
@@ -33,7 +31,7 @@ def loop_trajectory(count: int = 200, rate_hz: float = 20.0, begin_s: float = 10
     return Trajectory(begin_s + t, T, "loop")
 
 
-def make_run_folder(folder: Path, points: int = 2000, scale: float = 1.0, rate_hz: float = 20.0) -> Path:
+def make_run_folder(folder, points=2000, scale=1.0, rate_hz=20.0):
     """Fill ``folder`` with a run's files; returns a ground-truth file beside it."""
     rng = np.random.default_rng(0)
     (folder / "keyframes").mkdir(parents=True)
@@ -72,7 +70,7 @@ def make_run_folder(folder: Path, points: int = 2000, scale: float = 1.0, rate_h
     return folder.parent / "truth.txt"
 
 
-def _write_status(path: Path, run: Trajectory, rng: np.random.Generator) -> None:
+def _write_status(path, run, rng):
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS.split())
@@ -88,12 +86,12 @@ def _write_status(path: Path, run: Trajectory, rng: np.random.Generator) -> None
 
 
 @pytest.fixture(scope="session")
-def run_folder() -> Callable[..., Path]:
+def run_folder():
     """`make_run_folder`, for tests that need one."""
     return make_run_folder
 
 
 @pytest.fixture(scope="session")
-def loop() -> Trajectory:
+def loop():
     """`loop_trajectory` with its defaults."""
     return loop_trajectory()

@@ -2,8 +2,6 @@
 
 import argparse
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,15 +14,13 @@ from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory, write_k
 from edgeslam_torch.eval.metrics.run_score import evaluate_run
 
 
-def run(module: object, *words: object) -> int:
+def run(module, *words):
     parser = argparse.ArgumentParser()
-    module.add_arguments(parser)  # type: ignore[attr-defined]
-    return int(module.main(parser.parse_args([str(w) for w in words])))  # type: ignore[attr-defined]
+    module.add_arguments(parser)
+    return int(module.main(parser.parse_args([str(w) for w in words])))
 
 
-def test_several_runs_give_an_aligned_table(
-    run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_several_runs_give_an_aligned_table(run_folder, tmp_path, capsys):
     truth = run_folder(tmp_path / "a")
     run_folder(tmp_path / "b", scale=1.2)
     runs = [tmp_path / "a", tmp_path / "b", tmp_path / "a" / "trajectory_online.txt"]
@@ -44,7 +40,7 @@ def test_several_runs_give_an_aligned_table(
     assert (tmp_path / "plots" / "trajectories.png").is_file()
 
 
-def own_recording(run_dir: Path, truth: Path) -> None:
+def own_recording(run_dir, truth):
     """The run says that it read a folder with ground truth."""
     folder = run_dir.parent / f"recording of {run_dir.name}"
     folder.mkdir()
@@ -53,9 +49,7 @@ def own_recording(run_dir: Path, truth: Path) -> None:
     (run_dir / "summary.json").write_text(json.dumps(summary | {"source": str(folder)}))
 
 
-def test_a_run_is_judged_by_the_truth_of_its_recording(
-    run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_is_judged_by_the_truth_of_its_recording(run_folder, tmp_path, capsys):
     own_recording(tmp_path / "a", run_folder(tmp_path / "a"))
     assert run(eval_command, tmp_path / "a", "--markdown", "-", "--json", tmp_path / "s.json") == 0
     assert "| a | 0.0" in capsys.readouterr().out
@@ -64,9 +58,7 @@ def test_a_run_is_judged_by_the_truth_of_its_recording(
         run(eval_command, tmp_path / "a" / "trajectory.txt")
 
 
-def test_two_runs_are_compared(
-    run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_runs_are_compared(run_folder, tmp_path, capsys):
     own_recording(tmp_path / "a", run_folder(tmp_path / "a"))
     run_folder(tmp_path / "b", scale=1.2)
     assert run(compare_command, tmp_path / "a", tmp_path / "b" / "trajectory.txt") == 0
@@ -77,9 +69,7 @@ def test_two_runs_are_compared(
         run(compare_command, tmp_path / "a", tmp_path / "b")
 
 
-def test_one_broken_run_does_not_hide_the_others(
-    run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_broken_run_does_not_hide_the_others(run_folder, tmp_path, capsys):
     truth = run_folder(tmp_path / "a")
     (tmp_path / "empty.txt").write_text("")
     assert run(eval_command, tmp_path / "empty.txt", tmp_path / "a", "--groundtruth", truth) == 1
@@ -87,9 +77,7 @@ def test_one_broken_run_does_not_hide_the_others(
     assert "\na  " in out and "empty.txt" in err
 
 
-def test_peers_are_compared_on_common_frames_and_told_apart(
-    run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_peers_are_compared_on_common_frames_and_told_apart(run_folder, tmp_path, capsys):
     truth = run_folder(tmp_path / "a")
     (tmp_path / "peer").mkdir()
     rows = (tmp_path / "a" / "trajectory.txt").read_text().splitlines(keepends=True)
@@ -101,7 +89,7 @@ def test_peers_are_compared_on_common_frames_and_told_apart(
     assert [str(tmp_path / "peer" / "a"), "120"] in common and [str(tmp_path / "a"), "200"] in common
 
 
-def test_file_without_stamps_is_laid_on_the_images(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_file_without_stamps_is_laid_on_the_images(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     dataset = tmp_path / "data"
     dataset.mkdir()
@@ -115,14 +103,14 @@ def test_file_without_stamps_is_laid_on_the_images(run_folder: Callable[..., Pat
     assert "in order" in score.notes[0]
 
 
-def test_scale_interval_of_the_run_is_checked(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_scale_interval_of_the_run_is_checked(run_folder, tmp_path):
     truth = run_folder(tmp_path / "a")
     run_folder(tmp_path / "b", scale=1.2)  # says 3 %, is 20 % off
     assert evaluate_run(tmp_path / "a", truth).scale_inside_95 is True
     assert evaluate_run(tmp_path / "b", truth).scale_inside_95 is False
 
 
-def test_coverage_counts_frames_that_rest_on_their_own_image(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_coverage_counts_frames_that_rest_on_their_own_image(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     dataset = tmp_path / "data"
     dataset.mkdir()
@@ -137,7 +125,7 @@ def test_coverage_counts_frames_that_rest_on_their_own_image(run_folder: Callabl
 
 
 @pytest.mark.parametrize("what", ["missing", "file", "no ground truth"])
-def test_wrong_folders_get_one_line(what: str, run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_wrong_folders_get_one_line(what, run_folder, tmp_path):
     truth = run_folder(tmp_path / "a")
     (tmp_path / "empty").mkdir()
     with pytest.raises(EdgeSlamError) as caught:
@@ -150,7 +138,7 @@ def test_wrong_folders_get_one_line(what: str, run_folder: Callable[..., Path], 
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
 
 
-def test_report_says_how_the_run_went(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_report_says_how_the_run_went(run_folder, tmp_path):
     truth = run_folder(tmp_path / "a")
     assert run(report_command, tmp_path / "a", "--groundtruth", truth) == 0
     page = (tmp_path / "a" / "report.html").read_text(encoding="utf-8")
@@ -160,14 +148,14 @@ def test_report_says_how_the_run_went(run_folder: Callable[..., Path], tmp_path:
     assert "{{" not in page.split("<script")[0]
 
 
-def test_report_of_a_bare_run_is_a_page_too(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_report_of_a_bare_run_is_a_page_too(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     for name in ("status.csv", "summary.json", "edge_map.ply", "anchors.ply", "config.toml", "trajectory_online.txt"):
         (tmp_path / "a" / name).unlink()
     assert run(report_command, tmp_path / "a") == 0
 
 
-def test_depth_maps_are_judged_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_depth_maps_are_judged_by_name(tmp_path, capsys):
     for name, metres in (("ours", 1.1), ("truth", 1.0)):
         (tmp_path / name).mkdir()
         np.save(tmp_path / name / "0001.npy", np.full((4, 6), metres))
@@ -177,7 +165,7 @@ def test_depth_maps_are_judged_by_name(tmp_path: Path, capsys: pytest.CaptureFix
     assert json.loads((tmp_path / "d.json").read_text())[str(tmp_path / "ours")]["median_scaled"]["delta1"] == 1.0
 
 
-def test_first_trajectory_is_converted(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_first_trajectory_is_converted(run_folder, tmp_path):
     truth = run_folder(tmp_path / "a")
     words = (tmp_path / "a", "--groundtruth", truth, "--convert")
     assert run(eval_command, *words, "euroc", tmp_path / "t.csv") == 0

@@ -5,9 +5,7 @@ import importlib.util
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import astuple
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,7 +15,7 @@ import yaml
 from edgeslam_torch.cli import main
 from edgeslam_torch.commands import export_map
 from edgeslam_torch.errors import EdgeSlamError
-from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.types import PointCloud
 from edgeslam_torch.writers.maps.colmap import write_colmap
@@ -35,7 +33,7 @@ from edgeslam_torch.writers.ply import write_ply
 
 
 @pytest.fixture
-def cloud(rng: np.random.Generator) -> PointCloud:
+def cloud(rng):
     return PointCloud(
         rng.normal(size=(50, 3)).astype(np.float32),
         rng.integers(0, 256, (50, 3)).astype(np.uint8),
@@ -44,7 +42,7 @@ def cloud(rng: np.random.Generator) -> PointCloud:
     )
 
 
-def test_pcd_is_what_the_format_page_says(cloud: PointCloud, tmp_path: Path) -> None:
+def test_pcd_is_what_the_format_page_says(cloud, tmp_path):
     """Read by the header alone, as a PCL reader does."""
     write_pcd(tmp_path / "m.pcd", cloud)
     head, body = (tmp_path / "m.pcd").read_bytes().split(b"DATA binary\n")
@@ -63,7 +61,7 @@ def test_pcd_is_what_the_format_page_says(cloud: PointCloud, tmp_path: Path) -> 
     np.testing.assert_array_equal(points["observations"], cloud.observations)
 
 
-def test_plyfile_reads_what_was_written(cloud: PointCloud, tmp_path: Path) -> None:
+def test_plyfile_reads_what_was_written(cloud, tmp_path):
     plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed")
     write_ply(tmp_path / "m.ply", cloud)
     found = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
@@ -88,7 +86,7 @@ print(json.dumps({
 
 
 @pytest.mark.parametrize("camera", [PRESETS["tum_fr1"], PRESETS["kinect"]], ids=["distorted", "pinhole"])
-def test_colmap_reads_the_model_and_projects_as_we_do(camera: Camera, cloud: PointCloud, tmp_path: Path) -> None:
+def test_colmap_reads_the_model_and_projects_as_we_do(camera, cloud, tmp_path):
     if importlib.util.find_spec("pycolmap") is None:
         pytest.skip("pycolmap is not installed: the COLMAP model is not read by COLMAP")
     T = np.tile(np.eye(4), (2, 1, 1))
@@ -105,22 +103,22 @@ def test_colmap_reads_the_model_and_projects_as_we_do(camera: Camera, cloud: Poi
     np.testing.assert_allclose(np.array(found["pixel"]) - 0.5, ours.reshape(2), atol=1e-3)
 
 
-def wall_at(x: float, half_m: float = 1.0) -> np.ndarray:
+def wall_at(x, half_m=1.0):
     y = np.linspace(-half_m, half_m, 400)
     return np.stack([np.full(400, x), y, np.tile([0.9, 1.1], 200)], axis=1)
 
 
-def seen_from(eye: tuple[float, float, float], p_w: np.ndarray, sigma_m: float = 0.01) -> SightLines:
+def seen_from(eye, p_w, sigma_m=0.01):
     return SightLines(np.broadcast_to(np.array(eye), p_w.shape), p_w, np.full(len(p_w), sigma_m))
 
 
-def value_at(grid: OccupancyGrid, x: float, y: float) -> int:
+def value_at(grid, x, y):
     column = int((x - grid.origin[0]) / grid.resolution_m)
     row = int((y - grid.origin[1]) / grid.resolution_m)
     return int(grid.cells[grid.cells.shape[0] - 1 - row, column])
 
 
-def test_occupancy_grid_has_walls_where_they_are(tmp_path: Path) -> None:
+def test_occupancy_grid_has_walls_where_they_are(tmp_path):
     wall = wall_at(2.02)
     floor = np.stack([np.linspace(0.3, 1.9, 400), wall[:, 1], np.zeros(400)], axis=1)  # below the heights
     p_w = np.concatenate([wall, floor])
@@ -136,7 +134,7 @@ def test_occupancy_grid_has_walls_where_they_are(tmp_path: Path) -> None:
     assert len(columns) == 1, "the wall is one cell thick"
 
 
-def test_bare_wall_with_edges_behind_it_is_not_free() -> None:
+def test_bare_wall_with_edges_behind_it_is_not_free():
     """A wall without edges at 1 m hides edges at 3 m, which were seen from the other room alone: nobody looked
     through the wall, so neither it nor the space behind it is free, seen from here."""
     beside, behind = wall_at(1.0)[:20], wall_at(3.0)
@@ -151,13 +149,13 @@ def test_bare_wall_with_edges_behind_it_is_not_free() -> None:
 
 
 @pytest.mark.parametrize(("sigma_m", "x", "expected"), [(0.05, 1.7, FREE), (0.25, 1.7, UNKNOWN), (0.25, 1.3, FREE)])
-def test_space_is_free_up_to_two_sigma_before_what_was_seen(sigma_m: float, x: float, expected: int) -> None:
+def test_space_is_free_up_to_two_sigma_before_what_was_seen(sigma_m, x, expected):
     wall = wall_at(2.0)
     grid = occupancy_grid(wall, seen_from((0.0, 0.0, 1.0), wall, sigma_m), np.array([[0.0, 0.0, 1.0]]))
     assert value_at(grid, x, 0.0) == expected
 
 
-def test_sight_above_the_heights_frees_nothing() -> None:
+def test_sight_above_the_heights_frees_nothing():
     wall = wall_at(2.0)
     lamps = wall + [0.0, 0.0, 2.0]  # seen at 45 degrees upwards: the ray leaves the heights half a metre ahead
     grid = occupancy_grid(np.concatenate([wall, lamps]), seen_from((0.0, 0.0, 1.0), lamps), np.array([[0.0, 0.0, 1.0]]))
@@ -165,13 +163,13 @@ def test_sight_above_the_heights_frees_nothing() -> None:
     assert value_at(grid, 1.0, 0.0) == UNKNOWN
 
 
-def test_point_without_a_sigma_frees_nothing() -> None:
+def test_point_without_a_sigma_frees_nothing():
     wall = wall_at(2.0)
     lines = seen_from((0.0, 0.0, 1.0), wall, np.nan)
     assert value_at(occupancy_grid(wall, lines, np.array([[0.0, 0.0, 1.0]])), 1.0, 0.0) == UNKNOWN
 
 
-def test_grid_without_sight_lines_is_free_where_the_camera_was() -> None:
+def test_grid_without_sight_lines_is_free_where_the_camera_was():
     none = np.zeros((0, 3))
     lines = SightLines(none, none, np.zeros(0))
     grid = occupancy_grid(wall_at(2.0), lines, np.array([[0.0, 0.0, 1.0]]))
@@ -179,14 +177,14 @@ def test_grid_without_sight_lines_is_free_where_the_camera_was() -> None:
     assert np.count_nonzero(grid.cells == FREE) == 1
 
 
-def export(*words: object) -> int:
+def export(*words):
     parser = argparse.ArgumentParser()
     export_map.add_arguments(parser)
     return export_map.main(parser.parse_args([str(w) for w in words]))
 
 
 @pytest.mark.parametrize("form", [form for form in export_map.FORMATS if form != "nerfstudio"])
-def test_command_writes_every_format(form: str, run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_command_writes_every_format(form, run_folder, tmp_path):
     run_folder(tmp_path / "a")
     save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
     before = set((tmp_path / "a").rglob("*"))
@@ -194,23 +192,21 @@ def test_command_writes_every_format(form: str, run_folder: Callable[..., Path],
     assert set((tmp_path / "a").rglob("*")) > before
 
 
-def test_nerfstudio_without_images_says_so(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_nerfstudio_without_images_says_so(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
     with pytest.raises(EdgeSlamError, match=r"images of the keyframes are not there; .*--keep-images"):
         export(tmp_path / "a", "--format", "nerfstudio")
 
 
-def test_run_without_observations_has_points_without_images(
-    run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_without_observations_has_points_without_images(run_folder, tmp_path, capsys):
     run_folder(tmp_path / "a")
     save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
     assert export(tmp_path / "a", "--format", "colmap") == 0
     assert "points are not linked to images" in capsys.readouterr().out
 
 
-def test_occupancy_needs_metres(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_occupancy_needs_metres(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     path = tmp_path / "a" / "summary.json"
     summary = json.loads(path.read_text())
@@ -221,9 +217,7 @@ def test_occupancy_needs_metres(run_folder: Callable[..., Path], tmp_path: Path)
 
 
 @pytest.mark.parametrize("up", [None, {"source": "unknown", "sigma_deg": None}])
-def test_occupancy_of_a_possibly_tilted_map_needs_an_option(
-    up: dict[str, object] | None, run_folder: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_occupancy_of_a_possibly_tilted_map_needs_an_option(up, run_folder, tmp_path):
     run_folder(tmp_path / "a")
     path = tmp_path / "a" / "summary.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "up": up}))
@@ -235,9 +229,7 @@ def test_occupancy_of_a_possibly_tilted_map_needs_an_option(
 
 
 @pytest.mark.parametrize("scale", ["null", "{}", None], ids=["null", "empty", "no summary"])
-def test_unknown_units_are_said(
-    scale: str | None, run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unknown_units_are_said(scale, run_folder, tmp_path, capsys):
     run_folder(tmp_path / "a")
     (tmp_path / "a" / "summary.json").unlink()
     if scale is not None:
@@ -246,7 +238,7 @@ def test_unknown_units_are_said(
     assert "the folder does not say" in capsys.readouterr().out
 
 
-def test_empty_map_is_said(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_empty_map_is_said(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     empty = np.zeros((0, 3), np.float32)
     write_ply(
@@ -257,7 +249,7 @@ def test_empty_map_is_said(run_folder: Callable[..., Path], tmp_path: Path) -> N
         export(tmp_path / "a", "--format", "occupancy")
 
 
-def test_nothing_left_is_said(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_nothing_left_is_said(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     with pytest.raises(EdgeSlamError, match="no point is left"):
         export(tmp_path / "a", "--format", "ply", "--max-sigma", 1e-9)
@@ -275,14 +267,7 @@ KNOWN = {"source": "edges", "sigma_deg": 1.24}
         ("ply", "", {"source": 3, "sigma_deg": "x"}),
     ],
 )
-def test_every_exported_map_says_whether_z_is_up(
-    run_folder: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    form: str,
-    file: str,
-    up: object,
-) -> None:
+def test_every_exported_map_says_whether_z_is_up(run_folder, tmp_path, capsys, form, file, up):
     if form == "las":
         pytest.importorskip("laspy")
     run_folder(tmp_path / "run", points=100)

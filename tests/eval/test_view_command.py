@@ -5,9 +5,6 @@ import importlib.util
 import subprocess
 import sys
 import webbrowser
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,20 +19,15 @@ from edgeslam_torch.types import FrameStatus, PointCloud, ScaleEstimate, SlamOut
 HAS_RERUN = importlib.util.find_spec("rerun") is not None
 
 
-def run_view(*words: object) -> int:
+def run_view(*words):
     parser = argparse.ArgumentParser()
     view.add_arguments(parser)
     return view.main(parser.parse_args([str(w) for w in words]))
 
 
-def test_page_is_made_when_missing_and_opened(
-    run_folder: Callable[..., Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_page_is_made_when_missing_and_opened(run_folder, tmp_path, monkeypatch, capsys):
     run_folder(tmp_path / "a")
-    opened: list[str] = []
+    opened = []
     monkeypatch.setattr(webbrowser, "open", lambda address: opened.append(address) or True)
     assert run_view(tmp_path / "a") == 0
     assert opened == [(tmp_path / "a" / "report.html").resolve().as_uri()]
@@ -44,22 +36,22 @@ def test_page_is_made_when_missing_and_opened(
 
 
 @pytest.mark.skipif(HAS_RERUN, reason="rerun is installed here")
-def test_missing_rerun_is_said_with_the_remedy(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_missing_rerun_is_said_with_the_remedy(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     with pytest.raises(MissingPackageError, match=r"pip install 'edgeslam-torch\[viewer\]'"):
         run_view(tmp_path / "a", "--viewer")
 
 
-def test_rerun_is_not_imported_by_the_module() -> None:
+def test_rerun_is_not_imported_by_the_module():
     code = "import sys, edgeslam_torch.viewer.rerun_viewer; sys.exit('rerun' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def recorded(path: Path) -> dict[str, list[dict[str, Any]]]:
+def recorded(path):
     """Rows of a recording by entity, as rerun's own reader gives them: component to value, ``time`` in seconds."""
     from rerun.chunk import RrdReader
 
-    rows: dict[str, list[dict[str, Any]]] = {}
+    rows = {}
     for chunk in RrdReader(path).stream():
         batch = chunk.to_record_batch()
         columns = {name: batch[name].to_pylist() for name in batch.schema.names if ":" in name}
@@ -74,7 +66,7 @@ needs_rerun = pytest.mark.skipif(not HAS_RERUN, reason="rerun is not installed: 
 
 
 @needs_rerun
-def test_recording_of_a_finished_run_holds_its_map_and_poses(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_recording_of_a_finished_run_holds_its_map_and_poses(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
     assert run_view(tmp_path / "a", "--save-rrd", tmp_path / "a.rrd") == 0
@@ -95,7 +87,7 @@ def test_recording_of_a_finished_run_holds_its_map_and_poses(run_folder: Callabl
 
 
 @needs_rerun
-def test_recording_of_a_live_run_holds_pictures_plots_and_the_growing_map(tmp_path: Path) -> None:
+def test_recording_of_a_live_run_holds_pictures_plots_and_the_growing_map(tmp_path):
     from edgeslam_torch.viewer.rerun_viewer import Viewer
 
     viewer = Viewer("live", save=tmp_path / "live.rrd", show=False)
@@ -129,7 +121,7 @@ def test_recording_of_a_live_run_holds_pictures_plots_and_the_growing_map(tmp_pa
 
 
 @needs_rerun
-def test_recording_that_cannot_be_written_is_said(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_recording_that_cannot_be_written_is_said(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     with pytest.raises(OutputError, match="summary.json"):
         run_view(tmp_path / "a", "--save-rrd", tmp_path / "a" / "summary.json" / "x.rrd")

@@ -2,8 +2,6 @@
 
 import os
 import stat
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -11,19 +9,19 @@ from edgeslam_torch.files.atomic import write_atomically, write_text
 
 
 @pytest.fixture
-def group_readable() -> Iterator[None]:
+def group_readable():
     before = os.umask(0o027)
     yield
     os.umask(before)
 
 
-def test_the_umask_decides_who_may_read(tmp_path: Path, group_readable: None) -> None:
+def test_the_umask_decides_who_may_read(tmp_path, group_readable):
     write_text(tmp_path / "a", "x")
     assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o640
 
 
-def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
-    def fail(file: object) -> None:
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
+    def fail(file):
         raise OSError("disk full")
 
     write_text(tmp_path / "a", "old")
@@ -33,6 +31,6 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_text() == "old"
 
 
-def test_file_name_that_is_no_unicode_does_not_stop_a_text(tmp_path: Path) -> None:
+def test_file_name_that_is_no_unicode_does_not_stop_a_text(tmp_path):
     write_text(tmp_path / "a.txt", "recording \udcff\n")
     assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "recording ?\n"

@@ -21,7 +21,7 @@ class Inner:
     span: tuple[float, float] = (0.5, math.inf)
     many: tuple[int, ...] = (1, 2)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         if self.count < 1:
             raise ValueError(f"count must be at least 1, got {self.count}")
 
@@ -126,8 +126,7 @@ def test_no_number_may_be_infinite_or_none(key):
 
 
 @pytest.mark.parametrize(
-    "option",
-    ["orb.levels=21", "orb.candidates=2000000000", "flow.window_px=1000000", "flow.levels=99"],
+    "option", ["orb.levels=21", "orb.candidates=2000000000", "flow.window_px=1000000", "flow.levels=99"]
 )
 def test_what_costs_gigabytes_or_hours_is_refused(option):
     with pytest.raises(ConfigError, match="must be at most"):

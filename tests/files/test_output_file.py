@@ -14,7 +14,7 @@ from edgeslam_torch.writers.run_writer import OUTPUTS
 
 
 @pytest.fixture
-def parser() -> argparse.ArgumentParser:
+def parser():
     parser = argparse.ArgumentParser()
     parser.add_argument("inputs", nargs="+")
     parser.add_argument("--json", type=output_file)
@@ -23,12 +23,12 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _check(parser: argparse.ArgumentParser, *words: object) -> None:
+def _check(parser, *words):
     check_outputs(parser, parser.parse_args([str(word) for word in words]))
 
 
 @pytest.mark.parametrize("name", [*OUTPUTS, "rgb.txt", "groundtruth.txt", "telemetry.csv", "mine.json"])
-def test_no_file_of_a_folder_that_is_read_is_replaced(parser, tmp_path: Path, name: str) -> None:
+def test_no_file_of_a_folder_that_is_read_is_replaced(parser, tmp_path, name):
     (tmp_path / name).touch()
     free = {"mine.json", "report.html", "map.png", "config.toml", "camera.yaml"}  # not read, or what calibrate makes
     with nullcontext() if name in free else pytest.raises(OutputError, match="reads"):
@@ -36,7 +36,7 @@ def test_no_file_of_a_folder_that_is_read_is_replaced(parser, tmp_path: Path, na
 
 
 @pytest.mark.parametrize("spelling", ["same", "relative", "symlink", "hard link"])
-def test_what_is_read_is_never_replaced(parser, tmp_path: Path, monkeypatch, spelling: str) -> None:
+def test_what_is_read_is_never_replaced(parser, tmp_path, monkeypatch, spelling):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "truth.txt"
     path.write_text("truth")
@@ -49,12 +49,12 @@ def test_what_is_read_is_never_replaced(parser, tmp_path: Path, monkeypatch, spe
         _check(parser, "first", path, "--json", other, "--overwrite")
 
 
-def test_two_results_need_two_files(parser, tmp_path: Path) -> None:
+def test_two_results_need_two_files(parser, tmp_path):
     with pytest.raises(OutputError, match="twice"):
         _check(parser, "in", "--json", tmp_path / "a", "-m", tmp_path / "." / "a")
 
 
-def test_a_folder_is_no_file(tmp_path: Path) -> None:
+def test_a_folder_is_no_file(tmp_path):
     with pytest.raises(OutputError, match="folder"):
         check_new(tmp_path, overwrite=True)
 
@@ -81,7 +81,7 @@ def test_a_folder_is_no_file(tmp_path: Path) -> None:
         "weights download near --out FILE",
     ],
 )
-def test_commands_leave_what_is_there(command: str, tmp_path: Path, capsys) -> None:
+def test_commands_leave_what_is_there(command, tmp_path, capsys):
     path = tmp_path / "truth.txt"
     path.write_text("".join(f"{i / 10:.1f} {i / 7:.4f} {(i % 5) / 3:.4f} 0 0 0 0 1\n" for i in range(60)))
     before = path.read_bytes()

@@ -1,7 +1,6 @@
 """Nothing is written through a link that lies in a folder of somebody else."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,7 +27,7 @@ KEEPING = {
 
 
 @pytest.fixture
-def theirs(tmp_path: Path) -> Path:
+def theirs(tmp_path):
     path = tmp_path / "elsewhere" / "theirs.txt"
     path.parent.mkdir()
     path.write_text("theirs")
@@ -38,7 +37,7 @@ def theirs(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("link", [os.symlink, os.link])
 @pytest.mark.parametrize("name", REPLACING)
-def test_a_link_is_replaced_and_not_followed(theirs: Path, name: str, link) -> None:
+def test_a_link_is_replaced_and_not_followed(theirs, name, link):
     path = theirs.parents[1] / "folder" / "a.png"
     link(theirs, path)
     REPLACING[name](path)
@@ -49,7 +48,7 @@ def test_a_link_is_replaced_and_not_followed(theirs: Path, name: str, link) -> N
 
 @pytest.mark.parametrize("link", [os.symlink, os.link])
 @pytest.mark.parametrize("name", KEEPING)
-def test_what_goes_on_in_a_file_goes_on_in_no_link(theirs: Path, name: str, link) -> None:
+def test_what_goes_on_in_a_file_goes_on_in_no_link(theirs, name, link):
     path = theirs.parents[1] / "folder" / ".lock"
     link(theirs, path)
     with pytest.raises((OSError, OutputError)):
@@ -58,22 +57,22 @@ def test_what_goes_on_in_a_file_goes_on_in_no_link(theirs: Path, name: str, link
 
 
 @pytest.mark.parametrize("name", REPLACING)
-def test_a_link_to_nothing_makes_nothing_there(tmp_path: Path, name: str) -> None:
+def test_a_link_to_nothing_makes_nothing_there(tmp_path, name):
     (tmp_path / "a.png").symlink_to(tmp_path / "nothing.png")
     REPLACING[name](tmp_path / "a.png")
     assert not (tmp_path / "nothing.png").exists()
 
 
 @pytest.mark.parametrize("name", [*REPLACING, *KEEPING])
-def test_a_pipe_is_refused_and_does_not_hang(tmp_path: Path, name: str) -> None:
+def test_a_pipe_is_refused_and_does_not_hang(tmp_path, name):
     os.mkfifo(tmp_path / ".lock")
     with pytest.raises((OSError, OutputError)):
         (REPLACING | KEEPING)[name](tmp_path / ".lock")
     assert (tmp_path / ".lock").is_fifo()
 
 
-def test_the_temporary_name_cannot_be_foreseen(tmp_path: Path) -> None:
-    seen: list[set[str]] = []
+def test_the_temporary_name_cannot_be_foreseen(tmp_path):
+    seen = []
     for _ in range(2):
         write_atomically(tmp_path / ("a" * 250), lambda _: seen.append({p.name for p in tmp_path.glob(".*")}))
     assert len(seen[0] | seen[1]) == 2
@@ -83,7 +82,7 @@ def test_the_temporary_name_cannot_be_foreseen(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.glob(".*")] == [".mine.part"]
 
 
-def test_a_folder_of_ours_is_no_link(tmp_path: Path) -> None:
+def test_a_folder_of_ours_is_no_link(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "rgb").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(OSError, match="link"):
@@ -93,7 +92,7 @@ def test_a_folder_of_ours_is_no_link(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "process 1 on board since yesterday"])
-def test_a_lock_of_a_killed_run_is_taken(tmp_path: Path, text: str) -> None:
+def test_a_lock_of_a_killed_run_is_taken(tmp_path, text):
     (tmp_path / ".lock").write_text(text)
     lock = FolderLock(tmp_path)
     assert (tmp_path / ".lock").read_text().startswith(f"process {os.getpid()} ")
@@ -101,7 +100,7 @@ def test_a_lock_of_a_killed_run_is_taken(tmp_path: Path, text: str) -> None:
     assert not (tmp_path / ".lock").exists()
 
 
-def test_a_lock_of_another_program_stays(tmp_path: Path) -> None:
+def test_a_lock_of_another_program_stays(tmp_path):
     (tmp_path / ".lock").write_text("of another program")
     with pytest.raises(OutputError, match="--out"):
         FolderLock(tmp_path)

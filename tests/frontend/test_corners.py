@@ -1,22 +1,20 @@
 """L-junctions on rendered frames with known corners, and on real frames that are turned."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.frontend.corners import JunctionConfig, Junctions, detect_junctions
+from edgeslam_torch.frontend.corners import JunctionConfig, detect_junctions
 
 
-def polygon(rng: np.random.Generator, centre: np.ndarray, radius: float, sides: int) -> np.ndarray:
+def polygon(rng, centre, radius, sides):
     """A convex polygon ``(sides, 2)`` with corners of 60 to 140 degrees, clockwise as seen."""
     step = 2 * np.pi / sides
     angle = rng.uniform(0, 2 * np.pi) + step * (np.arange(sides) + rng.uniform(-0.12, 0.12, sides))
     return centre + radius * np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
-def coverage(p: np.ndarray) -> tuple[slice, slice, np.ndarray]:
+def coverage(p):
     """Share of each pixel that a convex polygon covers, by an 8 x 8 grid in each, with rows and columns."""
     lo, hi = np.floor(p.min(0)).astype(int) - 1, np.ceil(p.max(0)).astype(int) + 2
     fine = (np.arange(8) + 0.5) / 8 - 0.5
@@ -29,7 +27,7 @@ def coverage(p: np.ndarray) -> tuple[slice, slice, np.ndarray]:
     return slice(lo[1], hi[1]), slice(lo[0], hi[0]), share
 
 
-def frame(rng: np.random.Generator, noise: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
+def frame(rng, noise=2.0):
     """A grey image of polygons, and their corners with both neighbours ``(C, 3, 2)``."""
     image = np.full((480, 640), 90.0)
     truth = []
@@ -45,12 +43,12 @@ def frame(rng: np.random.Generator, noise: float = 2.0) -> tuple[np.ndarray, np.
     return np.clip(np.round(blurred), 0, 255).astype(np.uint8), np.array(truth)
 
 
-def detect(grey: np.ndarray, config: JunctionConfig | None = None) -> Junctions:
+def detect(grey, config=None):
     smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)
     return detect_junctions(grey, cv2.Canny(smooth, 30, 80, L2gradient=True), config)
 
 
-def matched(found: Junctions, truth: np.ndarray, radius: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
+def matched(found, truth, radius=3.0):
     """Indices of found junctions and of the true ones nearest to them."""
     distance = np.linalg.norm(found.uv[:, None] - truth[None, :, 0], axis=2)
     nearest = distance.argmin(1)
@@ -59,7 +57,7 @@ def matched(found: Junctions, truth: np.ndarray, radius: float = 3.0) -> tuple[n
 
 
 @pytest.fixture(scope="module")
-def found_and_true() -> list[tuple[Junctions, np.ndarray]]:
+def found_and_true():
     return [(detect(image), truth) for image, truth in (frame(np.random.default_rng(seed)) for seed in range(6))]
 
 
@@ -139,12 +137,12 @@ def test_most_keeps_the_longest_arms(rng):
     np.testing.assert_array_equal(few.uv, everything.uv[:5])
 
 
-def turned_back(found: Junctions, height: int) -> np.ndarray:
+def turned_back(found, height):
     """Corners of an image that was turned by 90 degrees anticlockwise, in the upright image."""
     return np.stack([height - 1 - found.uv[:, 1], found.uv[:, 0]], 1)
 
 
-def check_turning(grey: np.ndarray, least: int) -> None:
+def check_turning(grey, least):
     """Turning an image by a right angle moves no pixel value, so nearly all junctions must come again."""
     found = detect(grey)
     again = detect(np.ascontiguousarray(cv2.rotate(grey, cv2.ROTATE_90_COUNTERCLOCKWISE)))
@@ -161,7 +159,7 @@ def test_turning_a_rendered_image_turns_its_junctions(rng):
 
 @pytest.mark.data
 @pytest.mark.parametrize("sequence", ["tum_fr1_xyz", "7scenes_redkitchen"])
-def test_turning_a_real_image_turns_its_junctions(sequence, data_dir: Path):
+def test_turning_a_real_image_turns_its_junctions(sequence, data_dir):
     images = sorted((data_dir / sequence).rglob("*.jpg"))
     if not images:
         pytest.skip(f"no images in {data_dir / sequence}")

@@ -12,12 +12,12 @@ from edgeslam_torch.types import DepthMap
 IMAGE = np.zeros((240, 320, 3), np.uint8)
 
 
-def depth_map(metres: float, sigma: float = 0.2) -> DepthMap:
+def depth_map(metres, sigma=0.2):
     return DepthMap(np.full((240, 320), metres, np.float32), np.full((240, 320), sigma, np.float32))
 
 
 @pytest.mark.parametrize("metres", [0.05, 0.3, 10.0, 100.0, 200.0])
-def test_a_plausible_map_passes_untouched(metres: float) -> None:
+def test_a_plausible_map_passes_untouched(metres):
     depth = depth_map(metres)
     checked = CheckedDepth(lambda image, camera: depth)
     assert checked(IMAGE, CAMERA) is depth
@@ -42,13 +42,13 @@ def test_a_plausible_map_passes_untouched(metres: float) -> None:
         (2.0, 1e30),
     ],
 )
-def test_an_implausible_map_is_rejected(metres: float, sigma: float) -> None:
+def test_an_implausible_map_is_rejected(metres, sigma):
     checked = CheckedDepth(lambda image, camera: depth_map(metres, sigma))
     assert checked(IMAGE, CAMERA) is None
     assert checked.refused == checked.maps == 1
 
 
-def test_single_bad_pixels_become_unknown_and_the_rest_stays() -> None:
+def test_single_bad_pixels_become_unknown_and_the_rest_stays():
     depth = depth_map(2.0)
     depth.depth_m[:100] = np.inf
     depth.sigma_log[100:110] = np.nan
@@ -60,13 +60,13 @@ def test_single_bad_pixels_become_unknown_and_the_rest_stays() -> None:
     assert usable(found).mean() == pytest.approx(130 / 240)
 
 
-def test_a_map_of_mostly_bad_pixels_is_rejected() -> None:
+def test_a_map_of_mostly_bad_pixels_is_rejected():
     depth = depth_map(2.0)
     depth.depth_m[:121] = np.nan
     assert CheckedDepth(lambda image, camera: depth)(IMAGE, CAMERA) is None
 
 
-def test_rejections_give_one_warning_with_their_count(caplog: pytest.LogCaptureFixture) -> None:
+def test_rejections_give_one_warning_with_their_count(caplog):
     maps = iter([depth_map(2.0), *[depth_map(np.nan)] * 5, depth_map(3.0)])
     checked = CheckedDepth(lambda image, camera: next(maps))
     with caplog.at_level(logging.WARNING):
@@ -76,7 +76,7 @@ def test_rejections_give_one_warning_with_their_count(caplog: pytest.LogCaptureF
     assert "unusable for 5 of 7 keyframes" in str(checked.warning())
 
 
-def test_a_function_without_depth_is_no_failure() -> None:
+def test_a_function_without_depth_is_no_failure():
     checked = CheckedDepth(lambda image, camera: None)
     assert checked(IMAGE, CAMERA) is None
     assert checked.warning() is None
@@ -85,7 +85,7 @@ def test_a_function_without_depth_is_no_failure() -> None:
 class Described:
     """A network whose depth is ``power`` of the truth, beside one that gives the truth."""
 
-    def __init__(self, power: float, relative: bool) -> None:
+    def __init__(self, power, relative):
         across = np.tile(np.linspace(1, 4, 320, dtype=np.float32), (240, 1))
         sigma = np.full_like(across, 0.2)
         self.map, self.truth = DepthMap(across**power, sigma, is_relative=relative), DepthMap(across, sigma)
@@ -101,7 +101,7 @@ class Described:
 
 
 @pytest.mark.parametrize("relative", [False, True])
-def test_inverted_depth_is_rejected_with_one_warning(relative, caplog) -> None:
+def test_inverted_depth_is_rejected_with_one_warning(relative, caplog):
     checked = CheckedDepth(Described(-1.0, relative))
     with caplog.at_level(logging.WARNING):
         assert [checked(IMAGE, CAMERA) for _ in range(8)] == [None] * 8

@@ -3,7 +3,6 @@
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,7 +22,7 @@ METADATA = Metadata(variant=Variant.PRUNED.value, input_height=96, input_width=1
 
 
 @pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def weights(tmp_path_factory):
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "w.safetensors"
     save_checkpoint(build_network(METADATA).eval(), METADATA, path)
@@ -31,12 +30,12 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def image(rng: np.random.Generator) -> np.ndarray:
+def image(rng):
     return cv2.resize(rng.integers(0, 256, (15, 20, 3), np.uint8), (160, 120), interpolation=cv2.INTER_CUBIC)
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
-def test_depth_has_the_images_size_and_is_positive(weights: Path, image: np.ndarray, backend: str) -> None:
+def test_depth_has_the_images_size_and_is_positive(weights, image, backend):
     predictor = DepthPredictor(weights, backend)
     depth = predictor(image, CAMERA)
     assert predictor.backend == backend
@@ -46,27 +45,27 @@ def test_depth_has_the_images_size_and_is_positive(weights: Path, image: np.ndar
         assert (field > 0).all()
 
 
-def test_backends_agree(weights: Path, image: np.ndarray) -> None:
+def test_backends_agree(weights, image):
     a, b = (DepthPredictor(weights, backend)(image, CAMERA) for backend in ("onnxruntime", "torch"))
     np.testing.assert_allclose(a.depth_m, b.depth_m, rtol=1e-4)
     np.testing.assert_allclose(a.sigma_log, b.sigma_log, rtol=1e-3)
 
 
-def test_depth_follows_the_focal_length(weights: Path, image: np.ndarray) -> None:
+def test_depth_follows_the_focal_length(weights, image):
     """The same pixels through a lens 1.2 times as long are 1.2 times as far away."""
     predictor = DepthPredictor(weights)
     long = predictor(image, replace(CAMERA, fx=1.2 * CAMERA.fx, fy=1.2 * CAMERA.fy))
     np.testing.assert_allclose(long.depth_m, 1.2 * predictor(image, CAMERA).depth_m, rtol=1e-5)
 
 
-def test_resolution_does_not_change_the_metres(weights: Path, image: np.ndarray) -> None:
+def test_resolution_does_not_change_the_metres(weights, image):
     large = cv2.resize(image, (480, 360), interpolation=cv2.INTER_NEAREST)
     predictor = DepthPredictor(weights)
     a = predictor(image, CAMERA).depth_m.mean()
     assert predictor(large, CAMERA.scaled(480, 360)).depth_m.mean() == pytest.approx(a, rel=0.05)
 
 
-def test_preprocessing_is_whole_image_rgb_in_minus_one_to_one() -> None:
+def test_preprocessing_is_whole_image_rgb_in_minus_one_to_one():
     image = np.zeros((64, 64, 3), np.uint8)
     image[:, :32, 0] = 255  # left half blue
     x = preprocess(image, 32, 32, Metadata())
@@ -77,7 +76,7 @@ def test_preprocessing_is_whole_image_rgb_in_minus_one_to_one() -> None:
     np.testing.assert_allclose(x[0, 0], -1.0, atol=1e-6)
 
 
-def test_a_shrunk_image_is_not_rounded_to_grey_levels() -> None:
+def test_a_shrunk_image_is_not_rounded_to_grey_levels():
     """Processors round a mean between two levels differently, and hence would see other depths."""
     image = np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8)
     mean = image.reshape(32, 2, 48, 2, 3).mean(axis=(1, 3))
@@ -87,7 +86,7 @@ def test_a_shrunk_image_is_not_rounded_to_grey_levels() -> None:
 
 
 @pytest.mark.parametrize("size", [(480, 640), (480, 752), (720, 960), (1080, 1920), (640, 480), (240, 320)])
-def test_network_input_has_the_images_shape_at_the_training_area(size: tuple[int, int]) -> None:
+def test_network_input_has_the_images_shape_at_the_training_area(size):
     metadata = Metadata(input_height=192, input_width=256)
     h, w = network_size(*size, (metadata.input_height, metadata.input_width))
     assert h % 32 == 0
@@ -96,7 +95,7 @@ def test_network_input_has_the_images_shape_at_the_training_area(size: tuple[int
     assert abs(np.log((w / h) / (size[1] / size[0]))) < 0.12
 
 
-def test_wrong_size_backend_and_files_are_rejected(weights: Path, image: np.ndarray, tmp_path: Path) -> None:
+def test_wrong_size_backend_and_files_are_rejected(weights, image, tmp_path):
     with pytest.raises(ValueError, match="does not fit"):
         DepthPredictor(weights)(image[:60], CAMERA)
     with pytest.raises(ValueError, match="backend"):
@@ -108,9 +107,7 @@ def test_wrong_size_backend_and_files_are_rejected(weights: Path, image: np.ndar
         DepthPredictor(tmp_path / "bad.onnx")
 
 
-def test_falls_back_to_torch_without_onnxruntime(
-    weights: Path, image: np.ndarray, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_falls_back_to_torch_without_onnxruntime(weights, image, monkeypatch, caplog):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     predictor = DepthPredictor(weights)
     assert predictor.backend == "torch"
@@ -118,7 +115,7 @@ def test_falls_back_to_torch_without_onnxruntime(
     assert predictor(image, CAMERA).depth_m.shape == (120, 160)
 
 
-def test_onnxruntime_backend_never_imports_torch(weights: Path) -> None:
+def test_onnxruntime_backend_never_imports_torch(weights):
     program = (
         "import sys; from pathlib import Path; from edgeslam_torch.frontend.depth_network import DepthPredictor;"
         f"DepthPredictor(Path({str(weights)!r})); sys.exit('torch' in sys.modules)"
@@ -128,12 +125,9 @@ def test_onnxruntime_backend_never_imports_torch(weights: Path) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    ("folder", "stride", "scaled", "metric"),
-    [("tum_fr1_xyz", 20, 0.10, 0.12), ("7scenes_redkitchen", 40, 0.23, 0.32)],
+    ("folder", "stride", "scaled", "metric"), [("tum_fr1_xyz", 20, 0.10, 0.12), ("7scenes_redkitchen", 40, 0.23, 0.32)]
 )
-def test_shipped_weights_on_rooms_they_were_not_trained_on(
-    data_dir: Path, folder: str, stride: int, scaled: float, metric: float
-) -> None:
+def test_shipped_weights_on_rooms_they_were_not_trained_on(data_dir, folder, stride, scaled, metric):
     """A loose bound above the model card's figures: detects broken preprocessing or a wrong focal length."""
     from edgeslam_torch.train.views.datasets import load_depth_folder
 
@@ -154,7 +148,7 @@ def test_shipped_weights_on_rooms_they_were_not_trained_on(
 # -- weights that give no depth ------------------------------------------------------------------------------------
 
 
-def changed(tmp_path: Path, metadata: Metadata = METADATA, **tensors: float) -> Path:
+def changed(tmp_path, metadata=METADATA, **tensors):
     """A network of which some tensors (``__`` for dots) hold one value everywhere."""
     torch.manual_seed(0)
     network = build_network(metadata).eval()
@@ -167,7 +161,7 @@ def changed(tmp_path: Path, metadata: Metadata = METADATA, **tensors: float) -> 
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
-def test_weights_without_depth_are_rejected_on_loading(tmp_path: Path, backend: str) -> None:
+def test_weights_without_depth_are_rejected_on_loading(tmp_path, backend):
     with pytest.raises(WeightsError, match=r"w\.safetensors: gives no depth"):
         DepthPredictor(changed(tmp_path, decode_conv6__1__bias=1e5), backend)
     with pytest.raises(WeightsError, match=r"w\.safetensors: gives no depth"):
@@ -178,6 +172,6 @@ def test_weights_without_depth_are_rejected_on_loading(tmp_path: Path, backend: 
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
-def test_weights_with_constant_output_are_rejected_on_loading(tmp_path: Path, backend: str) -> None:
+def test_weights_with_constant_output_are_rejected_on_loading(tmp_path, backend):
     with pytest.raises(WeightsError, match="the same depth whatever it sees"):
         DepthPredictor(changed(tmp_path, decode_conv6__0__weight=0.0, decode_conv6__1__bias=1.0), backend)

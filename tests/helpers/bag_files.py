@@ -1,8 +1,6 @@
 """Bags written by others' libraries: MCAP by mcap-ros2-support, ROS 1 and SQLite by rosbags."""
 
 import math
-from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,17 +46,17 @@ Event = tuple[str, str, float, dict[str, Any]]
 """Topic, type, time of receipt [s], message."""
 
 
-def stamp(t: float) -> dict[str, int]:
+def stamp(t):
     """``builtin_interfaces/Time``."""
     ns = round(t * 1e9)
     return {"sec": ns // 10**9, "nanosec": ns % 10**9}
 
 
-def header(t: float, frame: str = "") -> dict[str, Any]:
+def header(t, frame=""):
     return {"stamp": stamp(t), "frame_id": frame}
 
 
-def picture(t: float, pixels: np.ndarray, encoding: str, pad: int = 0, big: bool = False) -> dict[str, Any]:
+def picture(t, pixels, encoding, pad=0, big=False):
     """``sensor_msgs/Image`` of an array ``(H, W)`` or ``(H, W, C)``, with ``pad`` bytes after each row."""
     rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
     rows = np.pad(rows, ((0, 0), (0, pad)), constant_values=77)
@@ -74,13 +72,11 @@ def picture(t: float, pixels: np.ndarray, encoding: str, pad: int = 0, big: bool
     }
 
 
-def compressed(t: float, data: bytes, form: str) -> dict[str, Any]:
+def compressed(t, data, form):
     return {"header": header(t, "camera"), "format": form, "data": data}
 
 
-def camera_info(
-    size: tuple[int, int], f: float, d: Iterable[float] = (), model: str = "plumb_bob", **changes: Any
-) -> dict[str, Any]:
+def camera_info(size, f, d=(), model="plumb_bob", **changes):
     width, height = size
     k = [f, 0.0, (width - 1) / 2, 0.0, f, (height - 1) / 2, 0.0, 0.0, 1.0]
     roi = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
@@ -89,15 +85,15 @@ def camera_info(
     return info | {"r": np.eye(3).ravel().tolist(), "p": p, "binning_x": 0, "binning_y": 0, "roi": roi} | changes
 
 
-def xyz(v: Iterable[float]) -> dict[str, float]:
+def xyz(v):
     return dict(zip("xyz", map(float, v), strict=True))
 
 
-def quaternion(yaw: float) -> dict[str, float]:
+def quaternion(yaw):
     return {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
 
 
-def odometry(t: float, p: Iterable[float], yaw: float, v: Iterable[float], child: str = "base_link") -> dict[str, Any]:
+def odometry(t, p, yaw, v, child="base_link"):
     pose = {"position": xyz(p), "orientation": quaternion(yaw)}
     twist = {"linear": xyz(v), "angular": xyz((0, 0, 0))}
     return {
@@ -108,11 +104,11 @@ def odometry(t: float, p: Iterable[float], yaw: float, v: Iterable[float], child
     }
 
 
-def twist(t: float, v: Iterable[float], frame: str) -> dict[str, Any]:
+def twist(t, v, frame):
     return {"header": header(t, frame), "twist": {"linear": xyz(v), "angular": xyz((0, 0, 0))}}
 
 
-def imu(t: float, yaw: float, force: Iterable[float] = (0.0, 0.0, 9.81), known: bool = True) -> dict[str, Any]:
+def imu(t, yaw, force=(0.0, 0.0, 9.81), known=True):
     zero = [0.0] * 9
     return {
         "header": header(t, "base_link"),
@@ -125,11 +121,11 @@ def imu(t: float, yaw: float, force: Iterable[float] = (0.0, 0.0, 9.81), known: 
     }
 
 
-def write_mcap(path: Path, events: Iterable[Event]) -> Path:
+def write_mcap(path, events):
     """MCAP by mcap-ros2-support, which has its own CDR encoder."""
     from mcap_ros2.writer import Writer
 
-    schemas: dict[str, Any] = {}
+    schemas = {}
     with path.open("wb") as file:
         writer = Writer(file)
         for topic, kind, t, message in events:
@@ -140,10 +136,10 @@ def write_mcap(path: Path, events: Iterable[Event]) -> Path:
     return path
 
 
-def definition(kind: str) -> str:
+def definition(kind):
     """Text of a message type, followed by those of its parts."""
     parts, text = [DEFINITIONS[kind]], ""
-    seen: list[str] = []
+    seen = []
     while parts:
         text += parts[0] if not text else ""
         for line in parts.pop(0).splitlines():
@@ -154,7 +150,7 @@ def definition(kind: str) -> str:
     return text + "".join(f"{_RULE}MSG: {part}\n{_STANDARD[part]}" for part in seen)
 
 
-def write_ros1(path: Path, events: Iterable[Event]) -> Path:
+def write_ros1(path, events):
     """``.bag`` by rosbags."""
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
@@ -165,7 +161,7 @@ def write_ros1(path: Path, events: Iterable[Event]) -> Path:
     return path
 
 
-def write_ros2(path: Path, events: Iterable[Event]) -> Path:
+def write_ros2(path, events):
     """Folder with ``metadata.yaml`` and ``.db3`` by rosbags."""
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
@@ -176,15 +172,15 @@ def write_ros2(path: Path, events: Iterable[Event]) -> Path:
     return path
 
 
-def _write(writer: Any, store: Any, serialise: Callable[..., Any], events: Iterable[Event]) -> None:
-    connections: dict[str, Any] = {}
+def _write(writer, store, serialise, events):
+    connections = {}
     for topic, kind, t, message in events:
         if topic not in connections:
             connections[topic] = writer.add_connection(topic, kind, typestore=store)
         writer.write(connections[topic], round(t * 1e9), serialise(_record(store, kind, message), kind))
 
 
-def _record(store: Any, kind: str, fields: dict[str, Any]) -> Any:
+def _record(store, kind, fields):
     """A message of rosbags from plain dictionaries."""
     made = {}
     for name, description in store.fielddefs[kind][1]:

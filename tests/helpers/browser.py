@@ -7,9 +7,6 @@ import select
 import shutil
 import subprocess
 import time
-from pathlib import Path
-from types import TracebackType
-from typing import Any
 
 PROGRAM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
 """The browser on this machine; None without one."""
@@ -30,11 +27,11 @@ _FLAGS = (
 class Browser:
     """One page; errors that it meets are kept in ``errors``."""
 
-    def __init__(self, profile: Path) -> None:
+    def __init__(self, profile):
         ours_in, theirs_out = os.pipe()
         theirs_in, ours_out = os.pipe()
 
-        def as_three_and_four() -> None:
+        def as_three_and_four():
             low, high = os.dup(theirs_in), os.dup(theirs_out)
             os.dup2(low, 3)
             os.dup2(high, 4)
@@ -51,17 +48,17 @@ class Browser:
         self._in, self._out = ours_in, ours_out
         self._buffer = b""
         self._count = 0
-        self._session: dict[str, str] = {}
-        self.errors: list[str] = []
+        self._session = {}
+        self.errors = []
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self._session = {"sessionId": self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]}
         for domain in ("Page", "Runtime", "Log"):
             self.call(f"{domain}.enable")
 
-    def __enter__(self) -> "Browser":
+    def __enter__(self):
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, kind, error, at):
         os.write(self._out, b'{"id": 0, "method": "Browser.close"}\0')  # its children end with it, a kill leaves them
         try:
             self._process.wait(timeout=20.0)
@@ -71,7 +68,7 @@ class Browser:
         os.close(self._in)
         os.close(self._out)
 
-    def call(self, method: str, **params: Any) -> dict[str, Any]:
+    def call(self, method, **params):
         """One command of the DevTools protocol and its answer."""
         self._count += 1
         number = self._count
@@ -83,7 +80,7 @@ class Browser:
                 assert "error" not in answer, answer["error"]
                 return dict(answer["result"])
 
-    def open(self, page: Path, width: int = 1200, height: int = 900, ratio: float = 1.0, mobile: bool = False) -> None:
+    def open(self, page, width=1200, height=900, ratio=1.0, mobile=False):
         """Load a file as a screen of this size shows it, and wait until it is loaded."""
         self.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=ratio, mobile=mobile
@@ -92,17 +89,17 @@ class Browser:
         while self._read().get("method") != "Page.loadEventFired":
             pass
 
-    def run(self, script: str) -> Any:
+    def run(self, script):
         """Value of a JavaScript expression, awaited when it is a promise."""
         found = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
 
-    def picture(self, path: Path) -> None:
+    def picture(self, path):
         """Write what the window shows as PNG."""
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
 
-    def _read(self) -> dict[str, Any]:
+    def _read(self):
         limit = time.monotonic() + _PATIENCE_S
         while b"\0" not in self._buffer:
             ready, _, _ = select.select([self._in], [], [], max(0.0, limit - time.monotonic()))
@@ -111,11 +108,11 @@ class Browser:
             assert data, "the browser ended"
             self._buffer += data
         text, self._buffer = self._buffer.split(b"\0", 1)
-        message: dict[str, Any] = json.loads(text)
+        message = json.loads(text)
         self._note(message)
         return message
 
-    def _note(self, message: dict[str, Any]) -> None:
+    def _note(self, message):
         what = message.get("params", {})
         if message.get("method") == "Runtime.exceptionThrown":
             self.errors.append(json.dumps(what["exceptionDetails"])[:300])

@@ -1,7 +1,5 @@
 """A small recording with depth: noise on a ramp."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 
@@ -11,11 +9,11 @@ from edgeslam_torch.geometry.camera_file import save_camera
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
 
-def write_folder(folder: Path, count: int = 12, camera: Camera = CAMERA) -> Path:
+def write_folder(folder, count=12, camera=CAMERA):
     rng = np.random.default_rng(0)
     (folder / "rgb").mkdir(parents=True)
     (folder / "depth").mkdir()
-    lines: dict[str, list[str]] = {"rgb": ["# comment"], "depth": []}
+    lines = {"rgb": ["# comment"], "depth": []}
     depth = np.tile(np.linspace(1000, 3000, 64).astype(np.uint16), (48, 1))
     depth[:10] = 0
     depth[10:12] = 65535

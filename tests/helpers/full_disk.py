@@ -1,9 +1,5 @@
 """A disk that fills up while one file is written."""
 
-from pathlib import Path
-
-import pytest
-
 from edgeslam_torch.files import appender, plain
 
 
@@ -15,11 +11,11 @@ class FullDisk:
         name: Of the files.
     """
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-        self.room: int | None = None
+    def __init__(self, monkeypatch, name):
+        self.room = None
         opened = plain.create
 
-        def create_on_it(path: Path):
+        def create_on_it(path):
             file = opened(path)
             return _File(file, self) if path.name == name else file
 
@@ -27,7 +23,7 @@ class FullDisk:
 
 
 class _File:
-    def __init__(self, file, disk: FullDisk) -> None:
+    def __init__(self, file, disk):
         self.file, self.disk = file, disk
 
     def write(self, data):

@@ -18,10 +18,10 @@ class Row(NamedTuple):
     """Whether it says "all above" instead of names."""
 
 
-def layer_table(text: str) -> list[Row]:
+def layer_table(text):
     """Rows of the table below ``| layer |``, from the bottom of the house up."""
-    rows: list[Row] = []
-    below: list[str] = []
+    rows = []
+    below = []
     for line in text.split("| layer |", 1)[1].splitlines()[2:]:
         if not line.startswith("|"):
             break
@@ -33,7 +33,7 @@ def layer_table(text: str) -> list[Row]:
     return rows
 
 
-def _names(cell: str) -> tuple[str, ...]:
+def _names(cell):
     return tuple(name.strip("/") for name in re.findall(r"`([\w/]+)`", cell))
 
 
@@ -41,7 +41,7 @@ LAYERS = layer_table(TABLE.read_text(encoding="utf-8"))
 PARTS = [part for row in LAYERS for part in row.parts]
 
 
-def part_of(name: str) -> str | None:
+def part_of(name):
     """The table's part that a full module name belongs to, the most particular one; None for other packages."""
     words = name.split(".")
     if words[0] != "edgeslam_torch" or len(words) == 1:

@@ -31,46 +31,46 @@ class Case:
     """Takes no single item."""
 
 
-def uniform(low: float, high: float, *shape: int, seed: int = 0) -> Tensor:
+def uniform(low, high, *shape, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
 
 
-def pixels(*shape: int, seed: int) -> Tensor:
+def pixels(*shape, seed):
     return torch.stack((uniform(3, W - 4, *shape, seed=seed), uniform(3, H - 4, *shape, seed=seed + 100)), -1)
 
 
-def pair() -> Arguments:
+def pair():
     return {"T_j_i": lie.exp(TWIST), "uv": pixels(B, N, seed=1), "depth_i": uniform(2, 3, B, N, seed=2)}
 
 
-def cycle() -> Arguments:
+def cycle():
     return {**pair(), "depth_j": uniform(2.3, 2.7, B, H, W, seed=3), "K": K.expand(B, 3, 3)}
 
 
-def aligned() -> Arguments:
+def aligned():
     normal = nn.functional.normalize(uniform(-1, 1, B, N, 2, seed=4), dim=-1)
     return {**pair(), "uv_j": pixels(B, N, seed=5), "normal_j": normal, "K": K.expand(B, 3, 3)}
 
 
-def corners() -> Arguments:
+def corners():
     depth, cos_j = uniform(2, 3, B, C, 3, seed=7), uniform(-0.9, 0.9, B, C, seed=8)
     T_j_i, uv = lie.exp(TWIST), pixels(B, C, 3, seed=6)
     return {"T_j_i": T_j_i, "uv": uv, "depth_i": depth, "cos_j": cos_j, "K": K.expand(B, 3, 3)}
 
 
-def arms() -> Arguments:
+def arms():
     return {"p": uniform(-1, 1, B, C, 2, M, 3, seed=9), "mask": torch.ones(B, C, 2, M, dtype=torch.bool)}
 
 
-def window() -> Arguments:
+def window():
     T_c_w = torch.stack((torch.eye(4).double().expand(B, 4, 4), lie.exp(TWIST)), 1)
     p_w = losses.back_project(pixels(B, N, seed=10), uniform(2, 3, B, N, seed=11), K)
     mask = torch.ones(B, 2, N, dtype=torch.bool)
     return {"T_c_w": T_c_w, "p_w": p_w, "uv": pixels(B, 2, N, seed=12), "K": K.expand(B, 3, 3), "mask": mask}
 
 
-def dense() -> Arguments:
+def dense():
     mask = uniform(0, 1, B, 1, H, W, seed=15) > 0.2
     mask[0, 0, 0, 0] = True
     return {
@@ -80,7 +80,7 @@ def dense() -> Arguments:
     }
 
 
-def images() -> Arguments:
+def images():
     v, u = torch.meshgrid(torch.arange(H).double(), torch.arange(W).double(), indexing="ij")
     waves = [
         torch.stack((torch.sin(0.5 * (u - s)), torch.cos(0.4 * (u - s) + 0.3 * v), torch.sin(0.3 * (u - s) - 0.5 * v)))
@@ -98,15 +98,15 @@ def images() -> Arguments:
     }
 
 
-def smooth() -> Arguments:
+def smooth():
     return {"log_depth": uniform(0, 1, B, 1, H, W, seed=17), "image": uniform(0, 1, B, 3, H, W, seed=18)}
 
 
-def uncertain() -> Arguments:
+def uncertain():
     return {"log_sigma": uniform(-1, 0, B, 1, H, W, seed=19), **dense()}
 
 
-def lshape() -> Arguments:
+def lshape():
     return {**corners(), "arms": arms()["p"], "arms_mask": arms()["mask"]}
 
 

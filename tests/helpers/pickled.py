@@ -3,19 +3,18 @@
 import io
 import pickle
 import threading
-from typing import Any
 
 
 class _Pickler(pickle.Pickler):
     """Pickles a map: the copy gets a lock of its own."""
 
-    def reducer_override(self, obj: object) -> Any:
+    def reducer_override(self, obj):
         if isinstance(obj, type(threading.RLock())):
             return threading.RLock, ()
         return NotImplemented
 
 
-def pickled(state: object) -> bytes:
+def pickled(state):
     """Records of a flight as bytes, maps and their locks included."""
     buffer = io.BytesIO()
     _Pickler(buffer, protocol=pickle.HIGHEST_PROTOCOL).dump(state)

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from edgeslam_torch.geometry import se3_torch
 from edgeslam_torch.losses.robust import Kernel, rho
-from edgeslam_torch.optim.problem import LmConfig, WindowProblem
 
 
 class Unknowns(NamedTuple):
@@ -42,7 +41,7 @@ Term = tuple[Callable[[Unknowns], Tensor], float | None]
 """Whitened residuals ``(n, k)`` whose square over ``k`` goes through a kernel of this width; None for none."""
 
 
-def dense(problem: WindowProblem, config: LmConfig) -> Dense:
+def dense(problem, config):
     """Cost and normal equations of a window, without pose priors; all points must lie in front."""
     zero = _zero(problem)
     size = sum(x.numel() for x in zero)
@@ -61,7 +60,7 @@ def dense(problem: WindowProblem, config: LmConfig) -> Dense:
     return Dense(cost, H, g, (a, b, c, d))
 
 
-def step(system: Dense, mu: float) -> Tensor:
+def step(system, mu):
     """The damped step ``(N,)``, unknowns that nothing observes left alone."""
     damped = system.H + mu * torch.diag(system.H.diagonal())
     seen = system.H.diagonal() > 0
@@ -70,7 +69,7 @@ def step(system: Dense, mu: float) -> Tensor:
     return out
 
 
-def _zero(problem: WindowProblem) -> Unknowns:
+def _zero(problem):
     edges = 0 if problem.edges is None else len(problem.edges.host)
     junctions = 0 if problem.junctions is None else len(problem.junctions.host)
     free = int((~np.asarray(problem.pose_fixed)).sum())
@@ -78,28 +77,28 @@ def _zero(problem: WindowProblem) -> Unknowns:
     return Unknowns(*(torch.zeros(shape, dtype=torch.float64) for shape in shapes))
 
 
-def _terms(problem: WindowProblem, config: LmConfig) -> list[Term]:
+def _terms(problem, config):
     fx, fy, cx, cy = problem.K
     focal, centre = _t([fx, fy]), _t([cx, cy])
     start, free = _t(problem.T_c_w), torch.as_tensor(~np.asarray(problem.pose_fixed))
 
-    def poses(u: Unknowns) -> Tensor:
+    def poses(u):
         return start.index_put((free.nonzero()[:, 0],), se3_torch.exp(u.poses) @ start[free])
 
-    def in_camera(T: Tensor, p: Tensor) -> Tensor:
+    def in_camera(T, p):
         return (T[:, :3, :3] @ p[..., None])[..., 0] + T[:, :3, 3]
 
-    def pixel(p_c: Tensor) -> Tensor:
+    def pixel(p_c):
         return p_c[..., :2] / p_c[..., 2:] * focal + centre
 
-    def anchors(u: Unknowns) -> Tensor:
+    def anchors(u):
         p_c = in_camera(poses(u)[problem.obs_pose], (_t(problem.p_w) + u.anchors)[problem.obs_anchor])
         return (pixel(p_c) - _t(problem.uv)) * _t(problem.inv_sigma)[:, None]
 
-    terms: list[Term] = [(anchors, config.delta)]
+    terms = [(anchors, config.delta)]
     if (known := problem.depth_priors) is not None:
 
-        def depths(u: Unknowns) -> Tensor:
+        def depths(u):
             p_c = in_camera(poses(u)[known.pose], (_t(problem.p_w) + u.anchors)[known.anchor])
             return ((1.0 / p_c[:, 2] - _t(known.inverse_depth)) / _t(known.sigma))[:, None]
 
@@ -111,74 +110,74 @@ def _terms(problem: WindowProblem, config: LmConfig) -> list[Term]:
     return terms
 
 
-def _relative(T: Tensor, host: np.ndarray, target: np.ndarray) -> Tensor:
+def _relative(T, host, target):
     return T[target] @ se3_torch.inverse(T[host])
 
 
-def _edge_terms(problem, config, poses, in_camera, pixel) -> list[Term]:  # type: ignore[no-untyped-def]
+def _edge_terms(problem, config, poses, in_camera, pixel):
     e = problem.edges
     fx, fy, cx, cy = problem.K
     ray = torch.cat(((_t(e.uv) - _t([cx, cy])) / _t([fx, fy]), torch.ones(len(e.host), 1).double()), 1)
     which, host = e.pair_edge, np.asarray(e.host)[e.pair_edge]
 
-    def depth(u: Unknowns) -> Tensor:
+    def depth(u):
         return _t(e.inverse_depth) + u.edges
 
-    def in_target(u: Unknowns) -> Tensor:
+    def in_target(u):
         return in_camera(_relative(poses(u), host, e.pair_pose), (ray / depth(u)[:, None])[which])
 
-    def alignment(u: Unknowns) -> Tensor:
+    def alignment(u):
         across = ((pixel(in_target(u)) - _t(e.pair_uv)) * _t(e.pair_normal)).sum(1)
         return (across * _t(e.pair_inv_sigma))[:, None]
 
     held = np.asarray(e.pair_inverse_depth) > 0
 
-    def relative_depth(u: Unknowns) -> Tensor:
+    def relative_depth(u):
         z, z_held = in_target(u)[held, 2], 1.0 / _t(e.pair_inverse_depth)[held]
         return ((z - z_held) / (z + z_held) / e.cycle_sigma)[:, None]
 
-    def round_trip(u: Unknowns) -> Tensor:
+    def round_trip(u):
         p = in_target(u)[held]
         at_held_depth = p / p[:, 2:] / _t(e.pair_inverse_depth)[held, None]
         back = in_camera(_relative(poses(u), e.pair_pose[held], host[held]), at_held_depth)
         return ((pixel(back) - _t(e.uv)[which[held]]) / e.cycle_sigma).reshape(-1, 1)
 
-    def prior(u: Unknowns) -> Tensor:
+    def prior(u):
         known = np.isfinite(e.prior_sigma)
         return ((depth(u) - _t(e.prior))[known] / _t(e.prior_sigma)[known])[:, None]
 
-    terms: list[Term] = [(alignment, config.edge_delta), (prior, None)]
+    terms = [(alignment, config.edge_delta), (prior, None)]
     if e.cycle_sigma > 0:
         form = round_trip if e.cycle_px else relative_depth
         terms.append((form, config.edge_delta))
     return terms
 
 
-def _junction_terms(problem, config, poses, in_camera, pixel) -> list[Term]:  # type: ignore[no-untyped-def]
+def _junction_terms(problem, config, poses, in_camera, pixel):
     c = problem.junctions
     fx, fy, cx, cy = problem.K
     rays = (_t(c.uv) - _t([cx, cy])) / _t([fx, fy])
     rays = torch.cat((rays, torch.ones(*rays.shape[:2], 1).double()), 2)
     which, host = c.pair_junction, np.asarray(c.host)[c.pair_junction]
 
-    def depth(u: Unknowns) -> Tensor:
+    def depth(u):
         return _t(c.inverse_depth) + u.junctions
 
-    def ends(u: Unknowns) -> Tensor:
+    def ends(u):
         """Pixels ``(Q, 3, 2)`` of corner and arm ends in the target."""
         T = _relative(poses(u), host, c.pair_pose)
         p = (rays / depth(u)[..., None])[which]
         return torch.stack([pixel(in_camera(T, p[:, k])) for k in range(3)], 1)
 
-    def arms(u: Unknowns) -> Tensor:
+    def arms(u):
         uv = ends(u)
         along = uv[:, 1:] - uv[:, :1]
         return along / along.norm(dim=2, keepdim=True)
 
-    def corner(u: Unknowns) -> Tensor:
+    def corner(u):
         return ((ends(u)[:, 0] - _t(c.pair_uv)) * c.inv_sigma_px).reshape(-1, 1)
 
-    def angles(u: Unknowns) -> Tensor:
+    def angles(u):
         seen, measured = arms(u), _t(c.pair_arms)
         if c.cosines:
             cosine = (seen[:, 0] * seen[:, 1]).sum(1) - (measured[:, 0] * measured[:, 1]).sum(1)
@@ -188,11 +187,11 @@ def _junction_terms(problem, config, poses, in_camera, pixel) -> list[Term]:  # 
 
     root = torch.linalg.cholesky(_t(c.prior_information)).mT
 
-    def prior(u: Unknowns) -> Tensor:
+    def prior(u):
         return (root @ (depth(u) - _t(c.prior))[..., None])[..., 0]
 
     return [(corner, config.edge_delta), (angles, config.edge_delta), (prior, None)]
 
 
-def _t(x: object) -> Tensor:
+def _t(x):
     return torch.as_tensor(np.asarray(x, dtype=np.float64))

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray
@@ -25,7 +24,7 @@ class PointWorld:
     """``(3, 3)`` calibration matrix [px]."""
 
 
-def box_room(rng: np.random.Generator, n_points: int, dtype: DTypeLike = np.float64, *, n_views: int = 5) -> PointWorld:
+def box_room(rng, n_points, dtype=np.float64, *, n_views=5):
     """Points on floor, ceiling and walls of a 4 x 4 x 2.6 m room, and ``n_views`` cameras that face its +x wall.
 
     The cameras stand 0.5 m or more apart and see (in front of them) every point: all lie at x >= 0.8 m while the

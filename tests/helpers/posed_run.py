@@ -2,7 +2,6 @@
 
 import json
 from functools import cache
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,7 +10,6 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.house.views import look
-from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.synthetic.sites.build import place
 from edgeslam_torch.types import PointCloud
 from edgeslam_torch.writers.ply import write_ply
@@ -22,12 +20,12 @@ FRAMES = 12
 
 
 @cache
-def world() -> World:
+def world():
     """Drawn once: it is the slowest thing here."""
     return place("furnished_room", np.random.default_rng(5))
 
 
-def write_run(root: Path) -> Path:
+def write_run(root):
     """``root/recording`` and ``root/run``, which is returned."""
     rng = np.random.default_rng(5)
     images, run = root / "recording", root / "run"

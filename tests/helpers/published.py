@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 
 
-def png(value: int = 90, dtype: type = np.uint8) -> bytes:
+def png(value=90, dtype=np.uint8):
     """A small picture that does not compress well."""
     rng = np.random.default_rng(value)
     return cv2.imencode(".png", rng.integers(0, 255, (48, 64), dtype=dtype))[1].tobytes()
 
 
-def tgz(files: dict[str, bytes]) -> bytes:
+def tgz(files):
     """An archive as TUM and ICL-NUIM publish them."""
     out = io.BytesIO()
     with tarfile.open(fileobj=out, mode="w:gz") as archive:
@@ -25,7 +25,7 @@ def tgz(files: dict[str, bytes]) -> bytes:
     return out.getvalue()
 
 
-def zipped(files: dict[str, bytes]) -> bytes:
+def zipped(files):
     """An archive as 7-Scenes and EuRoC publish them."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:

@@ -1,6 +1,5 @@
 """The recordings that README quotes, packed as their publishers pack them, from the copies that the tests have."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -8,9 +7,8 @@ import numpy as np
 import yaml
 from published import tgz, zipped
 
-from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
+from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.types import FloatArray
 
 EUROC_MOUNT = np.array(
     [
@@ -23,7 +21,7 @@ EUROC_MOUNT = np.array(
 """``T_BS`` of EuRoC's cam0: the copies' true poses are the camera's, those of the publisher the body's."""
 
 
-def archives(data: Path, frames: int) -> Iterator[tuple[str, bytes]]:
+def archives(data, frames):
     """Name in the catalogue and content of each archive.
 
     Args:
@@ -41,12 +39,12 @@ def archives(data: Path, frames: int) -> Iterator[tuple[str, bytes]]:
     yield "euroc_mh_05", zipped({inside: zipped(_euroc(data / "euroc_mh05_a", frames))})
 
 
-def _list(path: Path) -> list[tuple[float, str]]:
+def _list(path):
     lines = [line.split() for line in path.read_text().splitlines() if line and not line.startswith("#")]
     return [(float(stamp), name) for stamp, name in lines]
 
 
-def _tum(copy: Path, folder: str, frames: int, faster: float) -> dict[str, bytes]:
+def _tum(copy, folder, frames, faster):
     images = _list(copy / "rgb.txt")[:frames]
     begin, end = images[0][0], images[-1][0]
     files = {}
@@ -59,7 +57,7 @@ def _tum(copy: Path, folder: str, frames: int, faster: float) -> dict[str, bytes
     return files | {f"{folder}/groundtruth.txt": poses.encode()}
 
 
-def _scene(data: Path, frames: int) -> dict[str, bytes]:
+def _scene(data, frames):
     copy = data / "7scenes_redkitchen"
     depth = {round(30 * stamp): copy / name for stamp, name in _list(copy / "depth.txt")}
     truth = read_trajectory(copy / "groundtruth.txt")
@@ -73,7 +71,7 @@ def _scene(data: Path, frames: int) -> dict[str, bytes]:
     return files
 
 
-def _euroc(copy: Path, frames: int) -> dict[str, bytes]:
+def _euroc(copy, frames):
     images = _list(copy / "rgb.txt")[:frames]
     numbers = [Path(name).stem for _, name in images]
     rows = "".join(f"{number},{number}.png\r\n" for number in numbers)
@@ -84,7 +82,7 @@ def _euroc(copy: Path, frames: int) -> dict[str, bytes]:
     return files
 
 
-def _euroc_sensor(camera: dict) -> str:
+def _euroc_sensor(camera):
     return (
         "#Default imu sensor yaml file\nsensor_type: camera\ncomment: VI-Sensor cam0 (MT9M034)\n\n"
         f"T_BS:\n  cols: 4\n  rows: 4\n  data: {EUROC_MOUNT.ravel().tolist()}\n\n"
@@ -94,8 +92,8 @@ def _euroc_sensor(camera: dict) -> str:
     )
 
 
-def _euroc_truth(camera: Trajectory) -> bytes:
-    def row(stamp: float, T: FloatArray) -> str:
+def _euroc_truth(camera):
+    def row(stamp, T):
         x, y, z, *q = se3.pose_to_tum(T @ np.linalg.inv(EUROC_MOUNT))
         return ",".join([f"{stamp * 1e9:.0f}", *(f"{v:.6f}" for v in (x, y, z, q[3], *q[:3])), *["0"] * 9])
 
@@ -103,6 +101,6 @@ def _euroc_truth(camera: Trajectory) -> bytes:
     return ("#timestamp, p_RS_R_x [m]\r\n" + "\r\n".join(rows) + "\r\n").encode()
 
 
-def _png(path: Path) -> bytes:
+def _png(path):
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()

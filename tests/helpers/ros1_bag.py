@@ -1,7 +1,6 @@
 """A ROS 1 bag with one camera, byte by byte after http://wiki.ros.org/Bags/Format/2.0: no library's idea of it."""
 
 import struct
-from collections.abc import Sequence
 
 DEFINITION = """Header header
 uint32 height
@@ -18,32 +17,32 @@ string frame_id
 """
 
 
-def _fields(**fields: bytes) -> bytes:
+def _fields(**fields):
     """``name=value`` with their lengths before them."""
     parts = [name.encode() + b"=" + value for name, value in fields.items()]
     return b"".join(struct.pack("<I", len(part)) + part for part in parts)
 
 
-def _record(data: bytes, **header: bytes) -> bytes:
+def _record(data, **header):
     head = _fields(**header)
     return struct.pack("<I", len(head)) + head + struct.pack("<I", len(data)) + data
 
 
-def _time(t: float) -> bytes:
+def _time(t):
     return struct.pack("<II", *divmod(round(t * 1e9), 10**9))
 
 
-def _string(text: bytes) -> bytes:
+def _string(text):
     return struct.pack("<I", len(text)) + text
 
 
-def _image(seq: int, t: float, width: int, height: int, encoding: bytes, pixels: bytes) -> bytes:
+def _image(seq, t, width, height, encoding, pixels):
     head = struct.pack("<I", seq) + _time(t) + _string(b"camera")
     size = struct.pack("<II", height, width)
     return head + size + _string(encoding) + struct.pack("<BI", 0, len(pixels) // height) + _string(pixels)
 
 
-def ros1_bag(topic: str, stamps_s: Sequence[float], pictures: Sequence[bytes], width: int, height: int) -> bytes:
+def ros1_bag(topic, stamps_s, pictures, width, height):
     """A bag of rgb8 pictures in one chunk, received when they were stamped."""
     name, u32 = topic.encode(), struct.Struct("<I").pack
     about = _fields(

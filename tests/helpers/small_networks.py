@@ -1,7 +1,5 @@
 """Depth networks of a few nodes, as other people's files look: depth or its inverse from the green channel."""
 
-from pathlib import Path
-
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
@@ -11,7 +9,7 @@ NEAR_M, FAR_M = 1.0, 4.0
 
 
 def green_network(
-    path: Path,
+    path,
     nodes=(),
     output="depth",
     size=("h", "w"),
@@ -81,7 +79,7 @@ RELATIVE = {
 """Arguments of `green_network` for inverse depth up to scale and shift."""
 
 
-def describe(path: Path, text: str) -> Path:
+def describe(path, text):
     """The TOML file beside a network."""
     path.with_suffix(".toml").write_text(text)
     return path

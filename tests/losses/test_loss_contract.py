@@ -27,8 +27,8 @@ class Case:
     arguments: Callable[[Tensor, Tensor], tuple[Tensor, ...]]
 
 
-def world(rng: np.random.Generator) -> dict[str, Tensor]:
-    def tensor(x: np.ndarray) -> Tensor:
+def world(rng):
+    def tensor(x):
         return torch.tensor(x, dtype=torch.float64)
 
     T_j_i = lie.exp(tensor(np.array([0.3, -0.1, 0.15, 0.02, -0.05, 0.08])))
@@ -48,7 +48,7 @@ def world(rng: np.random.Generator) -> dict[str, Tensor]:
     }
 
 
-def cases(rng: np.random.Generator) -> dict[str, Case]:
+def cases(rng):
     w = world(rng)
     eye = torch.eye(4, dtype=torch.float64)
     corners, corner_depths = w["uv"].view(8, 3, 2), w["depth"].view(8, 3)
@@ -59,22 +59,22 @@ def cases(rng: np.random.Generator) -> dict[str, Case]:
     lines = starts + steps * (ends - starts)
     bend = torch.tensor(rng.normal(size=lines.shape), dtype=torch.float64)
 
-    def moved(xi: Tensor) -> Tensor:
+    def moved(xi):
         return lie.exp(xi) @ w["T_j_i"]
 
-    def views(xi: Tensor, s: Tensor) -> tuple[Tensor, ...]:
+    def views(xi, s):
         return torch.stack((eye, moved(xi))), s * w["p_i"], torch.stack((w["uv"], w["uv_j"])), K
 
-    def cycle(xi: Tensor, s: Tensor) -> tuple[Tensor, ...]:
+    def cycle(xi, s):
         return moved(xi), w["uv"], s * w["depth"], w["depth_j"], K
 
-    def align(xi: Tensor, s: Tensor) -> tuple[Tensor, ...]:
+    def align(xi, s):
         return moved(xi), w["uv"], s * w["depth"], w["uv_j"], w["normal"], K
 
-    def angle(xi: Tensor, s: Tensor) -> tuple[Tensor, ...]:
+    def angle(xi, s):
         return moved(xi), corners, s * corner_depths, cos_j, K
 
-    def arms(xi: Tensor, s: Tensor) -> tuple[Tensor, ...]:
+    def arms(xi, s):
         return (lines + (s - 1.0) * bend + 0.0 * xi.sum(),)
 
     out = {
@@ -94,7 +94,7 @@ OFF = (torch.tensor([0.01, -0.02, 0.01, 0.004, 0.002, -0.003], dtype=torch.float
 
 
 @pytest.fixture
-def case(request: pytest.FixtureRequest, rng: np.random.Generator) -> Case:
+def case(request, rng):
     return cases(rng)[request.param]
 
 
@@ -118,7 +118,7 @@ def test_forward_reduces_squared_residuals(case):
 
 @pytest.mark.parametrize("case", NAMES, indirect=True)
 def test_gradient_is_twice_jacobian_times_residual(case):
-    def residual(xi: Tensor, s: Tensor) -> Tensor:
+    def residual(xi, s):
         return case.loss.residuals(*case.arguments(xi, s)).value.flatten()
 
     xi, s = OFF[0].clone().requires_grad_(), torch.tensor(OFF[1], dtype=torch.float64, requires_grad=True)
@@ -135,7 +135,7 @@ def test_gradient_under_a_kernel_is_twice_weighted_jacobian_times_residual(case,
     loss = case.loss
     loss.kernel, loss.delta = kernel, 0.5 * float(loss.residuals(*case.arguments(*OFF)).value.abs().max())
 
-    def residual(xi: Tensor) -> Tensor:
+    def residual(xi):
         value = loss.residuals(*case.arguments(xi, OFF[1])).value
         return value.reshape(-1, value.shape[-1])  # (N, R)
 
@@ -153,7 +153,7 @@ def test_gradient_of_the_other_angles_is_twice_jacobian_times_residual(form, rng
     corners, depth = w["uv"].view(8, 3, 2), w["depth"].view(8, 3).clone().requires_grad_()
     none, loss = torch.full((8,), torch.nan, dtype=torch.float64), AngleLoss(form, gate_cos=0.9)
 
-    def residual(d: Tensor) -> Tensor:
+    def residual(d):
         return loss.residuals(w["T_j_i"], corners, d, none, K).value[:, 0]
 
     valid = loss.residuals(w["T_j_i"], corners, depth, none, K).valid
@@ -211,7 +211,7 @@ def test_same_frame_angle_is_zero_whatever_the_depth_and_cross_view_is_not(form,
 
 
 def test_right_angle_prior_pulls_only_nearly_square_corners():
-    def corner(degrees: float) -> tuple[Tensor, Tensor]:
+    def corner(degrees):
         a = np.radians(degrees)
         p = torch.tensor([[[0.0, 0, 2], [0.5, 0, 2], [0.5 * np.cos(a), 0.5 * np.sin(a), 2]]], dtype=torch.float64)
         return project(p, K)[0], p[..., 2]

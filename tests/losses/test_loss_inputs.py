@@ -4,8 +4,7 @@ from itertools import product
 
 import pytest
 import torch
-from loss_cases import CASES, B, Case, H, W
-from torch import Tensor
+from loss_cases import CASES, B, H, W
 
 from edgeslam_torch import losses
 
@@ -13,15 +12,15 @@ EVERY = pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, c
 HALVES = pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
 
 
-def cast(arguments: dict[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
+def cast(arguments, dtype):
     return {name: x.to(dtype) if x.is_floating_point() else x for name, x in arguments.items()}
 
 
-def item(arguments: dict[str, Tensor], b: int) -> dict[str, Tensor]:
+def item(arguments, b):
     return {name: x[b] for name, x in arguments.items()}
 
 
-def gradient(case: Case, arguments: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+def gradient(case, arguments):
     """Loss and its gradient by what is predicted."""
     x = arguments[case.predicted].detach().clone().requires_grad_()
     value = case.loss(**{**arguments, case.predicted: x})
@@ -173,7 +172,7 @@ def test_holes_of_a_depth_map_are_not_mixed_into_its_samples():
     assert d[known].tolist() == [2.0, 2.0]
 
 
-def larger(arguments: dict[str, Tensor]) -> dict[str, Tensor]:
+def larger(arguments):
     """The batch with its first item once more at its end."""
     return {name: torch.cat((x, x[:1])).contiguous() for name, x in arguments.items()}
 
@@ -203,7 +202,7 @@ def test_exported_for_any_batch_it_gives_the_same(case):
         torch.testing.assert_close(program.module()(**some), case.loss(**some))
 
 
-def holed(case: Case, name: str, hole: float, everywhere: bool) -> tuple[Tensor, dict[str, Tensor]]:
+def holed(case, name, hole, everywhere):
     """Loss and every input's gradient with the first number of an input, or all of the first item's, replaced."""
     given = {key: x.clone() for key, x in case.given().items()}
     item = given[name].view(B, -1)[0]

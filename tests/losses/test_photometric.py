@@ -11,7 +11,7 @@ from edgeslam_torch.losses.photometric import ROUNDING_PX, PhotometricLoss, Smoo
 K = torch.tensor([[[20.0, 0.0, 11.5], [0.0, 20.0, 7.5], [0.0, 0.0, 1.0]]], dtype=torch.float64)
 
 
-def picture(shift_px: float = 0.0) -> torch.Tensor:
+def picture(shift_px=0.0):
     """Smooth stripes and blobs, moved to the right."""
     v, u = torch.meshgrid(torch.arange(16.0), torch.arange(24.0), indexing="ij")
     u = u - shift_px
@@ -19,13 +19,13 @@ def picture(shift_px: float = 0.0) -> torch.Tensor:
     return (rgb[None].double() + 1) / 2
 
 
-def sideways(x: float) -> torch.Tensor:
+def sideways(x):
     T = torch.eye(4, dtype=torch.float64)[None].clone()
     T[0, 0, 3] = x
     return T
 
 
-def test_warp_shifts_by_the_disparity() -> None:
+def test_warp_shifts_by_the_disparity():
     """Camera j 0.2 to the left of i: f b / z = 20 * 0.2 / 2 = 2 px to the right."""
     depth = torch.full((1, 1, 16, 24), 2.0, dtype=torch.float64)
     warped, valid = warp_to(picture(2.0), depth, sideways(0.2), K)
@@ -35,7 +35,7 @@ def test_warp_shifts_by_the_disparity() -> None:
     assert valid[0, 0, :, :-2].all()
 
 
-def test_warp_is_kornias() -> None:
+def test_warp_is_kornias():
     torch.manual_seed(0)
     depth, T = 1.5 + torch.rand(2, 1, 16, 24).double(), sideways(0.2).repeat(2, 1, 1)
     T[1, :3, :3] = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.1, 0.05], [0.1, 0.0, 0.02], [-0.05, -0.02, 0.0]]))
@@ -48,7 +48,7 @@ def test_warp_is_kornias() -> None:
     assert apart.max() < ROUNDING_PX  # on the border, where kornia's begins to be black
 
 
-def test_structural_similarity_is_kornias_with_a_mean_for_its_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_structural_similarity_is_kornias_with_a_mean_for_its_gaussian(monkeypatch):
     torch.manual_seed(0)
     a, b = torch.rand(2, 2, 3, 16, 24).double()
     mean = torch.full((1, 3), 1 / 3).double()
@@ -56,14 +56,14 @@ def test_structural_similarity_is_kornias_with_a_mean_for_its_gaussian(monkeypat
     torch.testing.assert_close(ssim(a, b), kornia.metrics.ssim(a, b, 3), atol=1e-5, rtol=0)
 
 
-def test_dissimilarity_is_zero_for_equal_images_and_positive_otherwise() -> None:
+def test_dissimilarity_is_zero_for_equal_images_and_positive_otherwise():
     torch.testing.assert_close(
         dissimilarity(picture(), picture()), torch.zeros(1, 1, 16, 24).double(), atol=1e-7, rtol=0
     )
     assert dissimilarity(picture(), picture(3.0)).mean() > 0.05
 
 
-def test_loss_prefers_the_true_depth() -> None:
+def test_loss_prefers_the_true_depth():
     loss = PhotometricLoss()
     image_i, images_j = picture(), picture(2.0)[:, None]
     costs = [
@@ -75,7 +75,7 @@ def test_loss_prefers_the_true_depth() -> None:
     assert costs[1] < min(costs[0], costs[2]) / 5
 
 
-def test_points_behind_the_camera_are_left_out() -> None:
+def test_points_behind_the_camera_are_left_out():
     T = torch.eye(4, dtype=torch.float64)[None].clone()
     T[0, 2, 3] = -5.0
     depth = torch.full((1, 1, 16, 24), 2.0, dtype=torch.float64, requires_grad=True)
@@ -86,7 +86,7 @@ def test_points_behind_the_camera_are_left_out() -> None:
     assert torch.isfinite(depth.grad).all()
 
 
-def test_smoothness_ignores_slopes_and_bends_at_contrast() -> None:
+def test_smoothness_ignores_slopes_and_bends_at_contrast():
     flat = torch.full((1, 3, 8, 8), 0.5)
     slope = torch.linspace(0, 1, 8).expand(1, 1, 8, 8)
     assert SmoothnessLoss()(slope, flat).item() == pytest.approx(0, abs=1e-6)

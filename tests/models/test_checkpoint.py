@@ -3,7 +3,6 @@
 import os
 import stat
 from collections import OrderedDict
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,13 +14,13 @@ from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.weights_file import read_header
 
 
-def small_network() -> tuple[FastDepth, Metadata]:
+def small_network():
     metadata = Metadata(variant=Variant.PRUNED.value, data=("a", "b"), metrics={"x": 0.5})
     torch.manual_seed(0)
     return build_network(metadata).eval(), metadata
 
 
-def test_weights_and_record_come_back(tmp_path: Path) -> None:
+def test_weights_and_record_come_back(tmp_path):
     network, metadata = small_network()
     save_checkpoint(network, metadata, tmp_path / "w.safetensors")
     loaded, record = load_checkpoint(tmp_path / "w.safetensors")
@@ -31,7 +30,7 @@ def test_weights_and_record_come_back(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / "w.safetensors"]
 
 
-def test_others_may_read_the_file_where_the_umask_lets_them(tmp_path: Path) -> None:
+def test_others_may_read_the_file_where_the_umask_lets_them(tmp_path):
     before = os.umask(0o022)
     try:
         save_checkpoint(*small_network(), tmp_path / "w.safetensors")
@@ -40,7 +39,7 @@ def test_others_may_read_the_file_where_the_umask_lets_them(tmp_path: Path) -> N
     assert stat.S_IMODE((tmp_path / "w.safetensors").stat().st_mode) == 0o644
 
 
-def test_half_precision_halves_the_file_and_hardly_changes_depth(tmp_path: Path) -> None:
+def test_half_precision_halves_the_file_and_hardly_changes_depth(tmp_path):
     network, metadata = small_network()
     for name, half in (("full", False), ("half", True)):
         save_checkpoint(network, metadata, tmp_path / name, half)
@@ -50,7 +49,7 @@ def test_half_precision_halves_the_file_and_hardly_changes_depth(tmp_path: Path)
     assert (a - b).abs().max() < 1e-2 * (1 + a.abs().max())
 
 
-def test_plain_torch_state_dict_is_read_as_upstreams(tmp_path: Path) -> None:
+def test_plain_torch_state_dict_is_read_as_upstreams(tmp_path):
     network = FastDepth(Variant.PRUNED)
     torch.save(network.state_dict(), tmp_path / "w.pt")
     loaded, metadata = load_checkpoint(tmp_path / "w.pt")
@@ -63,7 +62,7 @@ def test_plain_torch_state_dict_is_read_as_upstreams(tmp_path: Path) -> None:
     ("prefix", "key"),
     [("module.", None), ("_orig_mod.", "model"), ("model._orig_mod.module.", "state_dict"), ("", "model_state_dict")],
 )
-def test_wrappers_around_a_network_are_taken_off_and_no_origin_is_made_up(tmp_path, prefix, key, caplog) -> None:
+def test_wrappers_around_a_network_are_taken_off_and_no_origin_is_made_up(tmp_path, prefix, key, caplog):
     network = FastDepth(Variant.PRUNED)
     state = {prefix + name: value for name, value in network.state_dict().items()}
     torch.save(state if key is None else {key: state, "epoch": 3}, tmp_path / "w.pt")
@@ -74,13 +73,13 @@ def test_wrappers_around_a_network_are_taken_off_and_no_origin_is_made_up(tmp_pa
 
 
 @pytest.mark.parametrize("name", ["w.safetensors", "w.pt"])
-def test_a_pipe_is_no_weights_file(tmp_path, name) -> None:
+def test_a_pipe_is_no_weights_file(tmp_path, name):
     os.mkfifo(tmp_path / name)
     with pytest.raises(WeightsError, match="not a file"):
         load_checkpoint(tmp_path / name)
 
 
-def test_missing_truncated_and_foreign_files_are_named(tmp_path: Path) -> None:
+def test_missing_truncated_and_foreign_files_are_named(tmp_path):
     with pytest.raises(WeightsError, match="no such weights"):
         load_checkpoint(tmp_path / "none.safetensors")
     network, metadata = small_network()
@@ -95,7 +94,7 @@ def test_missing_truncated_and_foreign_files_are_named(tmp_path: Path) -> None:
         read_header(tmp_path / "text.safetensors")
 
 
-def test_pickled_module_is_refused_with_the_remedy(tmp_path: Path) -> None:
+def test_pickled_module_is_refused_with_the_remedy(tmp_path):
     parts = torch.nn.Sequential(OrderedDict(FastDepth(Variant.PRUNED).named_children()))
     torch.save({"model": parts}, tmp_path / "whole.pth.tar")
     with pytest.raises(WeightsError, match="edgeslam weights convert"):

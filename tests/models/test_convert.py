@@ -4,8 +4,6 @@ import argparse
 import os
 import sys
 import types
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,18 +17,18 @@ from edgeslam_torch.models.fastdepth import FastDepth, Variant
 
 
 @pytest.fixture
-def upstream_class() -> Iterator[type[nn.Module]]:
+def upstream_class():
     """A class that pickles as upstream's ``models.MobileNetSkipAdd`` does."""
     module = types.ModuleType("models")
 
     class MobileNetSkipAdd(nn.Module):
-        def __init__(self, network: FastDepth) -> None:
+        def __init__(self, network):
             super().__init__()
             for name, child in network.named_children():
                 self.add_module(name, child)
 
     MobileNetSkipAdd.__module__, MobileNetSkipAdd.__qualname__ = "models", "MobileNetSkipAdd"
-    module.MobileNetSkipAdd = MobileNetSkipAdd  # type: ignore[attr-defined]
+    module.MobileNetSkipAdd = MobileNetSkipAdd
     before = sys.modules.get("models")
     sys.modules["models"] = module
     yield MobileNetSkipAdd
@@ -41,7 +39,7 @@ def upstream_class() -> Iterator[type[nn.Module]]:
 
 @pytest.mark.filterwarnings("ignore:Couldn't retrieve source")
 @pytest.mark.parametrize("zipped", [True, False])
-def test_whole_module_becomes_tensors(tmp_path: Path, upstream_class: type[nn.Module], zipped: bool) -> None:
+def test_whole_module_becomes_tensors(tmp_path, upstream_class, zipped):
     network = FastDepth(Variant.PRUNED).eval()
     path = tmp_path / "model_best.pth.tar"
     content = {"model": upstream_class(network), "epoch": 19, "best_result": 0.6}
@@ -55,7 +53,7 @@ def test_whole_module_becomes_tensors(tmp_path: Path, upstream_class: type[nn.Mo
 
 
 @pytest.mark.filterwarnings("ignore:Couldn't retrieve source")
-def test_what_training_left_beside_the_network_is_passed_over(tmp_path: Path, upstream_class: type[nn.Module]) -> None:
+def test_what_training_left_beside_the_network_is_passed_over(tmp_path, upstream_class):
     """As upstream's training script saves it: arguments, optimiser and all."""
     network = upstream_class(FastDepth(Variant.PRUNED).eval())
     optimiser = torch.optim.SGD(network.parameters(), 0.1, momentum=0.9)
@@ -65,15 +63,15 @@ def test_what_training_left_beside_the_network_is_passed_over(tmp_path: Path, up
 
 
 class _Hostile:
-    def __init__(self, marker: Path) -> None:
+    def __init__(self, marker):
         self.marker = marker
 
-    def __reduce__(self) -> tuple[object, tuple[str]]:
+    def __reduce__(self):
         return os.system, (f"touch {self.marker}",)
 
 
 @pytest.mark.parametrize("zipped", [True, False])
-def test_hostile_pickle_is_refused_and_runs_nothing(tmp_path: Path, zipped: bool) -> None:
+def test_hostile_pickle_is_refused_and_runs_nothing(tmp_path, zipped):
     marker = tmp_path / "ran"
     torch.save({"model": _Hostile(marker)}, tmp_path / "evil.pth", _use_new_zipfile_serialization=zipped)
     with pytest.raises(WeightsError, match="refused"):
@@ -85,7 +83,7 @@ def test_hostile_pickle_is_refused_and_runs_nothing(tmp_path: Path, zipped: bool
     "name",
     ["builtins eval", "builtins getattr", "os system", "torch load", "torch.nn.modules.module os", "models exec"],
 )
-def test_names_outside_the_list_are_refused(tmp_path: Path, name: str) -> None:
+def test_names_outside_the_list_are_refused(tmp_path, name):
     module, attribute = name.split()
     program = f"c{module}\n{attribute}\n(V1+1\ntR.".encode()
     (tmp_path / "p.pth").write_bytes(program)
@@ -93,7 +91,7 @@ def test_names_outside_the_list_are_refused(tmp_path: Path, name: str) -> None:
         read_upstream(tmp_path / "p.pth")
 
 
-def test_damaged_files_are_named(tmp_path: Path, rng) -> None:  # type: ignore[no-untyped-def]
+def test_damaged_files_are_named(tmp_path, rng):
     torch.save(FastDepth(Variant.PRUNED).state_dict(), tmp_path / "w.pt", _use_new_zipfile_serialization=False)
     whole = (tmp_path / "w.pt").read_bytes()
     for cut in (0, 1, 20, 3000, len(whole) // 2, len(whole) - 3):

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from pytest import LogCaptureFixture, MonkeyPatch
 
 from edgeslam_torch.config import DepthConfig
 from edgeslam_torch.errors import ConfigError, WeightsError
@@ -28,7 +27,7 @@ CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 
 
 @pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def weights(tmp_path_factory):
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "w.safetensors"
     save_checkpoint(build_network(METADATA, SMALL).eval(), METADATA, path)
@@ -36,27 +35,27 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def exported(weights: Path, tmp_path: Path) -> Path:
+def exported(weights, tmp_path):
     path = tmp_path / "w.onnx"
     path.write_bytes(build_graph(weights)[0])
     return path
 
 
 @pytest.fixture
-def image() -> np.ndarray:
+def image():
     return np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8)
 
 
-def without_gpu(monkeypatch: MonkeyPatch) -> None:
+def without_gpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
 
 
-def onnxruntime_with(monkeypatch: MonkeyPatch, *built_in: str, usable: str = CPU) -> list[list[str]]:
+def onnxruntime_with(monkeypatch, *built_in, usable=CPU):
     """An onnxruntime that was built with some providers, of which only one works; what it is asked for."""
-    asked: list[list[str]] = []
+    asked = []
 
-    def session(content: bytes, options: object, providers: list[str]) -> SimpleNamespace:
+    def session(content, options, providers):
         asked.append(providers)
         return SimpleNamespace(get_providers=lambda: [usable])
 
@@ -71,9 +70,7 @@ def onnxruntime_with(monkeypatch: MonkeyPatch, *built_in: str, usable: str = CPU
     return asked
 
 
-def test_auto_is_the_processor_where_there_is_nothing_else(
-    weights: Path, image: np.ndarray, monkeypatch: MonkeyPatch
-) -> None:
+def test_auto_is_the_processor_where_there_is_nothing_else(weights, image, monkeypatch):
     without_gpu(monkeypatch)
     for backend in ("onnxruntime", "torch"):
         auto, plain = (DepthPredictor(weights, backend, device=device) for device in ("auto", "cpu"))
@@ -83,15 +80,13 @@ def test_auto_is_the_processor_where_there_is_nothing_else(
 
 @pytest.mark.parametrize("device", ["cuda", "mps"])
 @pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
-def test_a_device_that_is_not_there_is_refused_and_not_replaced(
-    weights: Path, backend: str, device: str, monkeypatch: MonkeyPatch
-) -> None:
+def test_a_device_that_is_not_there_is_refused_and_not_replaced(weights, backend, device, monkeypatch):
     without_gpu(monkeypatch)
     with pytest.raises(ConfigError, match=rf"--device {device}: .*no such device; use --device cpu"):
         open_depth(weights, backend, device=device)
 
 
-def test_an_onnx_file_needs_onnxruntimes_cuda(exported: Path, monkeypatch: MonkeyPatch) -> None:
+def test_an_onnx_file_needs_onnxruntimes_cuda(exported, monkeypatch):
     """Also where torch has it: the file does not run there."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     with pytest.raises(ConfigError, match="has no CUDA; install onnxruntime-gpu"):
@@ -103,7 +98,7 @@ def test_an_onnx_file_needs_onnxruntimes_cuda(exported: Path, monkeypatch: Monke
 
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:1", ""])
-def test_other_names_are_refused(weights: Path, device: str) -> None:
+def test_other_names_are_refused(weights, device):
     for ask in (find_device, onnx_providers, lambda name: open_depth(weights, device=name)):
         with pytest.raises(ConfigError, match="there are auto, cpu, cuda, mps"):
             ask(device)
@@ -116,15 +111,13 @@ def test_other_names_are_refused(weights: Path, device: str) -> None:
     [("cpu", (CUDA, CPU), [CPU]), ("auto", (CPU,), [CPU]), ("auto", (CUDA, CPU), [CUDA, CPU]),
      ("cuda", (CUDA, CPU), [CUDA, CPU])],
 )  # fmt: skip
-def test_onnxruntime_is_asked_for_the_device(
-    device: str, built_in: tuple[str, ...], asked: list[str], monkeypatch: MonkeyPatch
-) -> None:
+def test_onnxruntime_is_asked_for_the_device(device, built_in, asked, monkeypatch):
     log = onnxruntime_with(monkeypatch, *built_in, usable=asked[0])
     open_session(b"", Path("x.onnx"), 1, device)
     assert log == [asked]
 
 
-def test_onnxruntime_that_falls_back_silently_is_told(monkeypatch: MonkeyPatch, caplog: LogCaptureFixture) -> None:
+def test_onnxruntime_that_falls_back_silently_is_told(monkeypatch, caplog):
     """CUDA is built in, its libraries are missing: onnxruntime goes on with the processor and says nothing."""
     onnxruntime_with(monkeypatch, CUDA, CPU, usable=CPU)
     with pytest.raises(ConfigError, match=r"cannot use CUDA here .* use --device cpu"):
@@ -133,7 +126,7 @@ def test_onnxruntime_that_falls_back_silently_is_told(monkeypatch: MonkeyPatch, 
     assert "depth runs on the processor" in caplog.text
 
 
-def test_the_deployed_network_leaves_nothing_on_the_processor() -> None:
+def test_the_deployed_network_leaves_nothing_on_the_processor():
     """On the meta device, tensors have no values: one that was left elsewhere would not go with them."""
     network = deployed(build_network(METADATA, SMALL), METADATA).to("meta")
     log_depth, sigma = network(torch.zeros(1, 3, 64, 96, device="meta"))
@@ -142,7 +135,7 @@ def test_the_deployed_network_leaves_nothing_on_the_processor() -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA here")
-def test_cuda_gives_the_processors_depth(weights: Path, image: np.ndarray) -> None:
+def test_cuda_gives_the_processors_depth(weights, image):
     there, here = (DepthPredictor(weights, "torch", device=device) for device in ("cuda", "cpu"))
     assert there.backend.startswith("torch on cuda")
     np.testing.assert_allclose(there(image, CAMERA).depth_m, here(image, CAMERA).depth_m, rtol=1e-3)

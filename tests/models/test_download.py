@@ -6,9 +6,7 @@ import socket
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import pytest
 
@@ -26,7 +24,7 @@ class _Handler(BaseHTTPRequestHandler):
     interrupted = False
     content = CONTENT
 
-    def do_GET(self) -> None:
+    def do_GET(self):
         if self.path == "/missing":
             self.send_error(404)
             return
@@ -43,12 +41,12 @@ class _Handler(BaseHTTPRequestHandler):
             _Handler.interrupted, end = True, len(content) // 2
         self.wfile.write(content[start:end])
 
-    def log_message(self, *_: object) -> None:
+    def log_message(self, *_):
         """Quiet."""
 
 
 @pytest.fixture
-def server() -> Iterator[str]:
+def server():
     _Handler.interrupted, _Handler.content = False, CONTENT
     httpd = ThreadingHTTPServer(("127.0.0.1", 0), _Handler)
     thread = threading.Thread(target=httpd.serve_forever, daemon=True)
@@ -58,8 +56,8 @@ def server() -> Iterator[str]:
     httpd.server_close()
 
 
-def test_second_url_is_tried_and_checksum_returned(server: str, tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
+def test_second_url_is_tried_and_checksum_returned(server, tmp_path):
+    seen = []
     fetched = download(
         (f"{server}/missing", f"{server}/file"), tmp_path / "w", progress=lambda have, total: seen.append((have, total))
     )
@@ -68,7 +66,7 @@ def test_second_url_is_tried_and_checksum_returned(server: str, tmp_path: Path) 
     assert seen[-1] == (len(CONTENT), len(CONTENT))
 
 
-def test_broken_transfer_goes_on_where_it_stopped(server: str, tmp_path: Path) -> None:
+def test_broken_transfer_goes_on_where_it_stopped(server, tmp_path):
     with pytest.raises(WeightsError, match="run it again"):
         download((f"{server}/short",), tmp_path / "w")
     assert not (tmp_path / "w").exists()
@@ -77,7 +75,7 @@ def test_broken_transfer_goes_on_where_it_stopped(server: str, tmp_path: Path) -
     assert (tmp_path / "w").read_bytes() == CONTENT
 
 
-def test_wrong_checksum_leaves_nothing(server: str, tmp_path: Path) -> None:
+def test_wrong_checksum_leaves_nothing(server, tmp_path):
     with pytest.raises(WeightsError, match="checksum"):
         download((f"{server}/file",), tmp_path / "w", "0" * 64)
     assert list(tmp_path.iterdir()) == []
@@ -86,20 +84,20 @@ def test_wrong_checksum_leaves_nothing(server: str, tmp_path: Path) -> None:
 # -- trust on first use --------------------------------------------------------------------------------------------
 
 
-def test_https_comes_before_http() -> None:
+def test_https_comes_before_http():
     for remote in REMOTES.values():
         schemes = [url.split(":")[0] for url in remote.urls]
         assert schemes == sorted(schemes, reverse=True)
         assert set(schemes) == {"https", "http"}
 
 
-def test_where_https_does_not_answer_http_is_taken_and_known_as_such(server: str, tmp_path: Path) -> None:
+def test_where_https_does_not_answer_http_is_taken_and_known_as_such(server, tmp_path):
     fetched = download((f"{server}/file".replace("http:", "https:"), f"{server}/file"), tmp_path / "w")
     assert fetched.url == f"{server}/file"
     assert not fetched.encrypted
 
 
-def test_a_file_that_changed_since_the_first_download_is_not_taken(server: str, tmp_path: Path) -> None:
+def test_a_file_that_changed_since_the_first_download_is_not_taken(server, tmp_path):
     first = download((f"{server}/file",), tmp_path / "w")
     remember(tmp_path / "w", first.sha256)
     assert download((f"{server}/file",), tmp_path / "w").sha256 == first.sha256
@@ -112,7 +110,7 @@ def test_a_file_that_changed_since_the_first_download_is_not_taken(server: str, 
     assert download((f"{server}/file",), tmp_path / "w", changed).sha256 == changed
 
 
-def test_kept_checksum_is_what_sha256sum_reads(tmp_path: Path) -> None:
+def test_kept_checksum_is_what_sha256sum_reads(tmp_path):
     digest = hashlib.sha256(CONTENT).hexdigest()
     assert remembered(tmp_path / "w") is None
     remember(tmp_path / "w", digest)
@@ -121,12 +119,12 @@ def test_kept_checksum_is_what_sha256sum_reads(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"nonsense", b"12 w", b"\xff\xfe", b"g" * 64])
-def test_a_kept_checksum_that_is_none_counts_as_none(tmp_path: Path, content: bytes) -> None:
+def test_a_kept_checksum_that_is_none_counts_as_none(tmp_path, content):
     (tmp_path / "w.sha256").write_bytes(content)
     assert remembered(tmp_path / "w") is None
 
 
-def test_https_is_not_left_by_a_redirect() -> None:
+def test_https_is_not_left_by_a_redirect():
     handler, body = KeepEncryption(), io.BytesIO()
     for start, end, allowed in (
         ("https://a/x", "https://b/x", True),
@@ -143,13 +141,13 @@ def test_https_is_not_left_by_a_redirect() -> None:
                 handler.redirect_request(request, body, 302, "", {}, end)
 
 
-def test_a_server_without_http_is_one_line(server: str, tmp_path: Path) -> None:
+def test_a_server_without_http_is_one_line(server, tmp_path):
     with pytest.raises(WeightsError, match="download failed") as caught:
         download((f"{server}/garbage",), tmp_path / "w")
     assert "\n" not in str(caught.value)
 
 
-def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_cache_folder_follows_the_environment(monkeypatch, tmp_path):
     monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path))
     assert cache_folder() == tmp_path
     monkeypatch.delenv("EDGESLAM_CACHE")
@@ -157,20 +155,20 @@ def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch, t
     assert cache_folder() == tmp_path / "x" / "edgeslam"
 
 
-def test_a_server_that_drips_is_given_up(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_drips_is_given_up(server, tmp_path, monkeypatch):
     monkeypatch.setattr(fetching, "WATCHED_S", -1.0)
     monkeypatch.setattr(fetching, "LOWEST_SPEED", 1e15)
     with pytest.raises(TimeoutError, match="kB/s"):
         fetching.fetch(f"{server}/good", tmp_path / "part", 1 << 30)
 
 
-def test_a_server_that_never_ends_is_given_up(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_never_ends_is_given_up(server, tmp_path, monkeypatch):
     monkeypatch.setattr(fetching, "LONGEST_S", -1.0)
     with pytest.raises(TimeoutError, match="hours"):
         fetching.fetch(f"{server}/good", tmp_path / "part", 1 << 30)
 
 
-def test_a_server_that_accepts_and_says_nothing_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_accepts_and_says_nothing_is_given_up(tmp_path, monkeypatch):
     monkeypatch.setattr(fetching, "ANSWER_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}/x"

@@ -17,13 +17,13 @@ from edgeslam_torch.models.mobilenet import SameConv2d
         (Variant.NNCONV5DW, 0.74, 3.96),
     ],
 )
-def test_size_is_the_published_one(variant: Variant, giga_macs: float, mega_parameters: float) -> None:
+def test_size_is_the_published_one(variant, giga_macs, mega_parameters):
     size = measure_complexity(FastDepth(variant), 224, 224)
     assert size.macs / 1e9 == pytest.approx(giga_macs, abs=0.005)
     assert size.parameters / 1e6 == pytest.approx(mega_parameters, abs=0.015)
 
 
-def test_names_and_shapes_are_upstreams() -> None:
+def test_names_and_shapes_are_upstreams():
     skips = FastDepth(Variant.SKIPADD).state_dict()
     assert skips["conv0.0.weight"].shape == (32, 3, 3, 3)
     assert skips["conv13.3.weight"].shape == (1024, 1024, 1, 1)
@@ -38,19 +38,19 @@ def test_names_and_shapes_are_upstreams() -> None:
 
 
 @pytest.mark.parametrize("variant", [Variant.SKIPADD, Variant.PRUNED, Variant.NNCONV5DW])
-def test_widths_come_back_from_a_state_dict(variant: Variant) -> None:
+def test_widths_come_back_from_a_state_dict(variant):
     expected = PRUNED if variant is Variant.PRUNED else FULL
     assert Widths.of_state_dict(FastDepth(variant).state_dict()) == expected
 
 
-def test_widths_of_something_else_are_refused() -> None:
+def test_widths_of_something_else_are_refused():
     with pytest.raises(WeightsError, match="not a FastDepth"):
         Widths.of_state_dict({"fc.weight": torch.zeros(3)})
 
 
 @pytest.mark.parametrize("size", [(32, 64), (96, 32)])
 @pytest.mark.parametrize("output", list(Output))
-def test_any_multiple_of_32_keeps_its_size(size: tuple[int, int], output: Output) -> None:
+def test_any_multiple_of_32_keeps_its_size(size, output):
     network = FastDepth(Variant.PRUNED, output=output, uncertainty=True).eval()
     depth = network(torch.zeros(2, 3, *size))
     assert depth.shape == (2, 1, *size)
@@ -62,12 +62,12 @@ def test_any_multiple_of_32_keeps_its_size(size: tuple[int, int], output: Output
         torch.testing.assert_close(log_depth.exp(), depth)
 
 
-def test_other_sizes_are_refused() -> None:
+def test_other_sizes_are_refused():
     with pytest.raises(ValueError, match="multiples of 32"):
         FastDepth(Variant.PRUNED)(torch.zeros(1, 3, 224, 230))
 
 
-def test_same_padding_centres_on_odd_pixels() -> None:
+def test_same_padding_centres_on_odd_pixels():
     """TensorFlow pads an even input at stride 2 on the right only: output 0 sees inputs 0, 1, 2."""
     layer = SameConv2d(1, 1, 3, 2, 0, bias=False)
     torch.nn.init.ones_(layer.weight)

@@ -9,8 +9,6 @@ import subprocess
 import sys
 import textwrap
 import zipfile
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,33 +29,33 @@ MEMORY = 400 << 20
 """More than the process has already."""
 
 
-def text(value: str) -> bytes:
+def text(value):
     return b"X" + struct.pack("<I", len(value)) + value.encode()
 
 
-def number(value: int) -> bytes:
+def number(value):
     raw = value.to_bytes(9, "little", signed=True)
     return b"\x8a\x09" + raw
 
 
-def storage(count: int, key: str = "0", kind: bytes = b"FloatStorage") -> bytes:
+def storage(count, key="0", kind=b"FloatStorage"):
     return b"(" + text("storage") + b"ctorch\n" + kind + b"\n" + text(key) + text("cpu") + number(count) + b"NtQ"
 
 
-def shape(*sizes: int) -> bytes:
+def shape(*sizes):
     return b"(" + b"".join(map(number, sizes)) + b"t"
 
 
-def tensor(count: int, size: tuple[int, ...], stride: tuple[int, ...], offset: int = 0) -> bytes:
+def tensor(count, size, stride, offset=0):
     arguments = storage(count) + number(offset) + shape(*size) + shape(*stride) + b"\x89}"
     return b"ctorch._utils\n_rebuild_tensor_v2\n(" + arguments + b"tR"
 
 
-def table(name: str, value: bytes) -> bytes:
+def table(name, value):
     return b"}" + text(name) + value + b"s"
 
 
-def legacy(program: bytes, blocks: dict[str, bytes] | None = None) -> bytes:
+def legacy(program, blocks=None):
     """A file of torch < 1.6 around one program; ``blocks`` are the storages' bytes after their count."""
     keys = b"]" + b"".join(text(k) + b"a" for k in blocks or {})
     return (
@@ -74,7 +72,7 @@ def legacy(program: bytes, blocks: dict[str, bytes] | None = None) -> bytes:
     )
 
 
-def block(count: int, data: bytes) -> bytes:
+def block(count, data):
     return struct.pack("<Q", count) + data
 
 
@@ -127,7 +125,7 @@ PROGRAMS = {
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("hostile")
     for name, content in PROGRAMS.items():
         (folder / f"{name}.pth").write_bytes(content)
@@ -142,18 +140,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def shared_modules() -> nn.Module:
+def shared_modules():
     """Each level holds the one below it ten times: 10^14 names."""
-    module: nn.Module = nn.Conv2d(1, 1, 1)
+    module = nn.Conv2d(1, 1, 1)
     for _ in range(14):
         module = nn.Sequential(*[module] * 10)
     return module
 
 
-def zips(folder: Path) -> Iterator[tuple[str, bytes]]:
+def zips(folder):
     path = folder / "z"
 
-    def written(parts: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
+    def written(parts, compression=zipfile.ZIP_STORED):
         with zipfile.ZipFile(path, "w", compression) as archive:
             for name, data in parts.items():
                 archive.writestr(f"a/{name}", data)
@@ -179,7 +177,7 @@ def zips(folder: Path) -> Iterator[tuple[str, bytes]]:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_hostile_files_end_at_once_in_a_line_and_in_little_memory(folder: Path) -> None:
+def test_hostile_files_end_at_once_in_a_line_and_in_little_memory(folder):
     """One process for all of them; each may use what is left of its memory limit."""
     program = f"""
         import resource, sys, time
@@ -213,21 +211,21 @@ def test_hostile_files_end_at_once_in_a_line_and_in_little_memory(folder: Path) 
     assert "more than 300000 instructions" in said_of["30 million instructions"]
 
 
-def test_a_module_inside_itself_ends(tmp_path: Path) -> None:
+def test_a_module_inside_itself_ends(tmp_path):
     itself = b"ctorch.nn.modules.container\nSequential\n)\x81q\x00" + table("_modules", table("0", b"h\x00")) + b"b"
     (tmp_path / "w.pth").write_bytes(legacy(itself))
     with pytest.raises(WeightsError, match="more than 5000 modules"):
         read_upstream(tmp_path / "w.pth")
 
 
-def test_nothing_is_looked_up_or_called() -> None:
+def test_nothing_is_looked_up_or_called():
     """Even an allowed name is not resolved."""
     program = b"\x80\x02cos\nsystem\n" + text("exit 1") + b"\x85R."
     assert InertPickle(program, lambda name: True).load() == Call(Name("os", "system"), ("exit 1",))
 
 
 @pytest.mark.parametrize("zipped", [True, False])
-def test_random_damage_is_refused_or_harmless(tmp_path: Path, rng: np.random.Generator, zipped: bool) -> None:
+def test_random_damage_is_refused_or_harmless(tmp_path, rng, zipped):
     path = tmp_path / "w.pth"
     torch.save(FastDepth(Variant.PRUNED).state_dict(), path, _use_new_zipfile_serialization=zipped)
     whole = path.read_bytes()
@@ -245,7 +243,7 @@ def test_random_damage_is_refused_or_harmless(tmp_path: Path, rng: np.random.Gen
             assert str(path) in str(error)
 
 
-def test_strided_and_shared_tensors_are_those_that_torch_reads(tmp_path: Path) -> None:
+def test_strided_and_shared_tensors_are_those_that_torch_reads(tmp_path):
     """Transposed memory and two parameters in one block, as fused optimisers leave them."""
     torch.manual_seed(0)
     state = FastDepth(Variant.PRUNED).state_dict()

@@ -2,10 +2,7 @@
 
 import json
 import struct
-from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +23,7 @@ LOADERS = [load_checkpoint, build_graph, read_weights]
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def whole(tmp_path_factory):
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "w.safetensors"
     save_checkpoint(build_network(METADATA, SMALL), METADATA, path)
@@ -36,37 +33,37 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 class File:
     """A safetensors file taken apart: change ``header`` or ``data`` and write it again."""
 
-    def __init__(self, content: bytes) -> None:
+    def __init__(self, content):
         (length,) = struct.unpack("<Q", content[:8])
-        self.header: dict[str, Any] = json.loads(content[8 : 8 + length])
+        self.header = json.loads(content[8 : 8 + length])
         self.data = bytearray(content[8 + length :])
 
-    def array(self, name: str) -> np.ndarray:
+    def array(self, name):
         """View of a float32 tensor's numbers."""
         start, stop = self.header[name]["data_offsets"]
         return np.frombuffer(self.data, "<f4")[start // 4 : stop // 4]
 
-    def replace(self, name: str, kind: str, shape: list[int], content: bytes) -> None:
+    def replace(self, name, kind, shape, content):
         """Another tensor under a name, its bytes at the end."""
         start = len(self.data)
         self.data += content
         self.header[name] = {"dtype": kind, "shape": shape, "data_offsets": [start, len(self.data)]}
 
-    def record(self, **changes: Any) -> None:
+    def record(self, **changes):
         self.header["__metadata__"]["edgeslam"] = json.dumps(asdict(METADATA) | changes)
 
-    def write(self, path: Path) -> Path:
+    def write(self, path):
         header = json.dumps(self.header).encode()
         path.write_bytes(struct.pack("<Q", len(header)) + header + self.data)
         return path
 
 
 @pytest.fixture
-def file(whole: bytes) -> File:
+def file(whole):
     return File(whole)
 
 
-def refused(path: Path, match: str) -> None:
+def refused(path, match):
     for load in LOADERS:
         with pytest.raises(WeightsError, match=match) as caught:
             load(path)
@@ -80,7 +77,7 @@ def refused(path: Path, match: str) -> None:
 
 @pytest.mark.parametrize("variant", list(Variant))
 @pytest.mark.parametrize("uncertainty", [True, False])
-def test_layout_is_that_of_the_network(variant: Variant, uncertainty: bool) -> None:
+def test_layout_is_that_of_the_network(variant, uncertainty):
     widths = PRUNED if variant is Variant.PRUNED else FULL
     with torch.device("meta"):
         network = FastDepth(variant, uncertainty=uncertainty)
@@ -88,7 +85,7 @@ def test_layout_is_that_of_the_network(variant: Variant, uncertainty: bool) -> N
     assert parameter_shapes(variant, widths, uncertainty) == shapes
 
 
-def test_a_whole_file_comes_back(file: File, tmp_path: Path) -> None:
+def test_a_whole_file_comes_back(file, tmp_path):
     path = file.write(tmp_path / "w.safetensors")
     arrays, metadata = read_weights(path)
     assert metadata == METADATA == read_header(path)
@@ -98,7 +95,7 @@ def test_a_whole_file_comes_back(file: File, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["F16", "F64", "BF16"])
-def test_other_precisions_are_read_as_they_are_written(file: File, tmp_path: Path, kind: str) -> None:
+def test_other_precisions_are_read_as_they_are_written(file, tmp_path, kind):
     expected = torch.randn(8, 3, 3, 3)
     stored = expected.to({"F16": torch.float16, "F64": torch.float64, "BF16": torch.bfloat16}[kind])
     file.replace("conv0.0.weight", kind, [8, 3, 3, 3], stored.contiguous().view(torch.uint8).numpy().tobytes())
@@ -106,7 +103,7 @@ def test_other_precisions_are_read_as_they_are_written(file: File, tmp_path: Pat
     np.testing.assert_array_equal(arrays["conv0.0.weight"], stored.float().numpy())
 
 
-def test_step_counters_may_be_missing(file: File, tmp_path: Path) -> None:
+def test_step_counters_may_be_missing(file, tmp_path):
     file.header = {k: v for k, v in file.header.items() if not k.endswith("num_batches_tracked")}
     path = file.write(tmp_path / "w.safetensors")
     assert load_checkpoint(path)[1] == METADATA
@@ -132,10 +129,7 @@ def test_step_counters_may_be_missing(file: File, tmp_path: Path) -> None:
         (lambda f: f.replace("conv0.1.num_batches_tracked", "F32", [], bytes(4)), "holds F32 numbers, not I64"),
         (lambda f: f.header.update({"conv2.3.weight": f.header["conv3.3.weight"]}), "lies over another tensor"),
         (lambda f: f.record(variant="mobilenet-nnconv5"), "does not fit mobilenet-nnconv5: no parameter"),
-        (
-            lambda f: f.array("conv0.0.weight").__setitem__(-1, np.nan),
-            "conv0.0.weight holds values that are not",
-        ),
+        (lambda f: f.array("conv0.0.weight").__setitem__(-1, np.nan), "conv0.0.weight holds values that are not"),
         (lambda f: f.array("conv7.1.running_mean").__setitem__(0, np.inf), "running_mean holds values that are not"),
         (lambda f: f.array("uncertainty.bias").__setitem__(-1, -np.inf), "uncertainty.bias holds values that are not"),
         (lambda f: f.array("conv3.0.weight").__imul__(np.float32(1e30)), "conv3.0.weight reaches"),
@@ -143,19 +137,19 @@ def test_step_counters_may_be_missing(file: File, tmp_path: Path) -> None:
         (lambda f: f.array("conv3.1.running_var").__setitem__(0, -1.0), "running_var holds a negative variance"),
     ],
 )
-def test_another_network_is_refused(file: File, tmp_path: Path, change: Callable[[File], object], match: str) -> None:
+def test_another_network_is_refused(file, tmp_path, change, match):
     change(file)
     refused(file.write(tmp_path / "w.safetensors"), match)
 
 
-def test_widths_that_cannot_be_added_are_refused(tmp_path: Path) -> None:
+def test_widths_that_cannot_be_added_are_refused(tmp_path):
     widths = Widths((8, 8) + (16,) * 12, (16, 16, 16, 4, 8))
     torch.manual_seed(0)
     save_checkpoint(build_network(METADATA, widths), METADATA, tmp_path / "w.safetensors")
     refused(tmp_path / "w.safetensors", r"conv1 \(8\) cannot be added to decode_conv4 \(4\)")
 
 
-def test_a_network_far_beyond_any_fastdepth_is_refused(tmp_path: Path, file: File) -> None:
+def test_a_network_far_beyond_any_fastdepth_is_refused(tmp_path, file):
     """Its bytes would have to be there; a header alone cannot make us build 40 GB."""
     shapes = parameter_shapes(Variant.SKIPADD, Widths((4096,) * 14, (4096,) * 5), True)
     file.header = {"__metadata__": file.header["__metadata__"]}
@@ -166,7 +160,7 @@ def test_a_network_far_beyond_any_fastdepth_is_refused(tmp_path: Path, file: Fil
 
 # -- the record --------------------------------------------------------------------------------------------------
 
-WRONG: list[Any] = [None, [], {}, "text", "", -32, 1e5, float("nan"), float("inf"), True, 10**400, [[[]]], {"a": []}]
+WRONG = [None, [], {}, "text", "", -32, 1e5, float("nan"), float("inf"), True, 10**400, [[[]]], {"a": []}]
 FIELDS = {
     "variant": [0, "resnet"],
     "input_height": [0, 33, 64.0, 4096],
@@ -182,7 +176,7 @@ FIELDS = {
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_a_record_with_a_wrong_field_is_refused(field: str) -> None:
+def test_a_record_with_a_wrong_field_is_refused(field):
     for value in WRONG + FIELDS[field]:
         text = json.dumps(asdict(METADATA) | {field: value})
         with pytest.raises(WeightsError, match=f"metadata cannot be used: {field} must be") as caught:
@@ -191,7 +185,7 @@ def test_a_record_with_a_wrong_field_is_refused(field: str) -> None:
 
 
 @pytest.mark.parametrize("field", ["sigma_floor", "uncertainty", "licence", "notes", "data", "metrics"])
-def test_a_record_with_a_wrong_type_is_refused(field: str) -> None:
+def test_a_record_with_a_wrong_type_is_refused(field):
     wrong = {"uncertainty": [0, 1, "true"], "data": ["text", [1]], "metrics": [[], {"a": "b"}]}.get(
         field, [[], True, {}]
     )
@@ -216,7 +210,7 @@ def test_a_record_with_a_wrong_type_is_refused(field: str) -> None:
         ('{"input_width": ' + "9" * 5000 + "}", "not JSON"),
     ],
 )
-def test_what_is_no_record_is_refused(file: File, tmp_path: Path, text: str, match: str) -> None:
+def test_what_is_no_record_is_refused(file, tmp_path, text, match):
     file.header["__metadata__"]["edgeslam"] = text
     path = file.write(tmp_path / "w.safetensors")
     refused(path, match)
@@ -224,11 +218,11 @@ def test_what_is_no_record_is_refused(file: File, tmp_path: Path, text: str, mat
         read_header(path)
 
 
-def test_fields_of_newer_files_are_ignored() -> None:
+def test_fields_of_newer_files_are_ignored():
     assert metadata_from_json(json.dumps(asdict(METADATA) | {"lens": "fisheye"})) == METADATA
 
 
-def test_an_impossible_record_cannot_be_written() -> None:
+def test_an_impossible_record_cannot_be_written():
     with pytest.raises(ValueError, match="focal_px must be"):
         Metadata(focal_px=float("nan"))
     with pytest.raises(ValueError, match="sigma_floor must be positive"):
@@ -259,19 +253,19 @@ def test_an_impossible_record_cannot_be_written() -> None:
         (b"\xff\xfe", "not JSON"),
     ],
 )
-def test_a_header_that_makes_no_sense_is_refused(tmp_path: Path, header: bytes, match: str) -> None:
+def test_a_header_that_makes_no_sense_is_refused(tmp_path, header, match):
     path = tmp_path / "w.safetensors"
     path.write_bytes(struct.pack("<Q", len(header)) + header + bytes(8))
     refused(path, match)
 
 
 @pytest.mark.parametrize("length", [0, 1 << 20, (1 << 20) + 1, 1 << 40, (1 << 64) - 1])
-def test_a_header_of_any_claimed_length_is_refused(tmp_path: Path, length: int) -> None:
+def test_a_header_of_any_claimed_length_is_refused(tmp_path, length):
     (tmp_path / "w.safetensors").write_bytes(struct.pack("<Q", length) + b'{"a": 1}')
     refused(tmp_path / "w.safetensors", "damaged")
 
 
-def test_empty_missing_and_foreign_files_are_named(tmp_path: Path) -> None:
+def test_empty_missing_and_foreign_files_are_named(tmp_path):
     refused(tmp_path / "none", "no such weights file")
     refused(tmp_path, "not a file")
     for content in (b"", b"x", b"hello, this is no network at all", b"\x89PNG\r\n\x1a\n" + bytes(100), bytes(100)):
@@ -282,14 +276,14 @@ def test_empty_missing_and_foreign_files_are_named(tmp_path: Path) -> None:
     refused(tmp_path / "huge", "8192 MiB, more than any network")
 
 
-def test_truncated_anywhere_is_refused(whole: bytes, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_truncated_anywhere_is_refused(whole, tmp_path, rng):
     for cut in (1, 7, 8, 9, 1000, len(whole) - 1, *rng.integers(0, len(whole), 30)):
         (tmp_path / "w").write_bytes(whole[:cut])
         with pytest.raises(WeightsError, match=str(tmp_path / "w")):
             read_weights(tmp_path / "w")
 
 
-def test_random_damage_is_refused_or_harmless(whole: bytes, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_random_damage_is_refused_or_harmless(whole, tmp_path, rng):
     (length,) = struct.unpack("<Q", whole[:8])
     refusals = 0
     for _ in range(200):

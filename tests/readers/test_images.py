@@ -77,9 +77,7 @@ def test_a_jpeg_with_garbage_inside_is_left_out_and_named(entry, what):
     assert cv2.imread(str(listed.path)) is not None
     problems = []
     assert list(frames_of([listed], (320, 240), problems)) == []
-    assert [(p.file, p.reason) for p in problems] == [
-        (str(listed.path), "damaged JPEG data, or print colours (CMYK)"),
-    ]
+    assert [(p.file, p.reason) for p in problems] == [(str(listed.path), "damaged JPEG data, or print colours (CMYK)")]
     with pytest.raises(SourceError, match="damaged"):
         read_image(listed.path)
 

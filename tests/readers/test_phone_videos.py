@@ -2,7 +2,6 @@
 
 import struct
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ LEFT_BRIGHT = 24
 """Pixels of the first picture that are bright, from its left."""
 
 
-def _write(path: Path, codec: str = "libx264", stamps_ms=STAMPS_MS) -> Path:
+def _write(path, codec="libx264", stamps_ms=STAMPS_MS):
     """Pictures whose bright part grows by two pixels a frame."""
     try:
         container = av.open(str(path), "w")
@@ -51,7 +50,7 @@ def test_a_varying_rate_gives_the_stamps_of_the_container(tmp_path, name, codec)
     assert source.problems == []
 
 
-def _turn(path: Path, matrix) -> None:
+def _turn(path, matrix):
     """Write the display matrix of the track header (ISO 14496-12, 8.3.2), as a phone held upright does."""
     data = bytearray(path.read_bytes())
     at = data.index(b"tkhd") + 4 + 40

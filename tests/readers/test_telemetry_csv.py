@@ -102,8 +102,7 @@ def test_rows_without_order_or_numbers_are_skipped_and_counted(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "word"),
-    [("", "empty"), ("a,b\n1,2\n", "no clock"), ("stamp_s,colour\n1,2\n", "no known column")],
+    ("text", "word"), [("", "empty"), ("a,b\n1,2\n", "no clock"), ("stamp_s,colour\n1,2\n", "no known column")]
 )
 def test_files_that_are_no_telemetry_are_refused_in_one_line(tmp_path, text, word):
     path = write(tmp_path, text)
@@ -251,11 +250,7 @@ cells = st.one_of(
     st.sampled_from(["", "-", "1e999", "nan", "0x10", "1_0", "６", " 5 ", '"', "None"]),
     st.text(max_size=6),
 )
-lines = st.one_of(
-    st.lists(cells, max_size=16).map(",".join),
-    st.just(",".join(HEADER)),
-    st.text(max_size=60),
-)
+lines = st.one_of(st.lists(cells, max_size=16).map(",".join), st.just(",".join(HEADER)), st.text(max_size=60))
 
 
 def _reads_or_refuses(folder, data):

@@ -5,7 +5,7 @@ import math
 from edgeslam_torch.states.machine import NEXT, Event, Machine, State
 
 
-def after(*events: Event) -> Machine:
+def after(*events):
     machine = Machine()
     for stamp_s, event in enumerate(events):
         machine.apply(event, float(stamp_s))

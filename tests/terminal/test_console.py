@@ -14,11 +14,11 @@ from edgeslam_torch.terminal.console import Console, exit_code
 class Broken(io.StringIO):
     """A stream whose disk is full, or whose reader is gone."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number):
         super().__init__()
         self._number = number
 
-    def write(self, text: str) -> int:
+    def write(self, text):
         raise OSError(self._number, os.strerror(self._number))
 
 

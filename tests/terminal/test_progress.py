@@ -27,14 +27,14 @@ def unhurried(monkeypatch):
 
 
 class Clock:
-    def __init__(self) -> None:
+    def __init__(self):
         self.now = 100.0
 
-    def __call__(self) -> float:
+    def __call__(self):
         return self.now
 
 
-def lines(total: int, done: int, every_s: float) -> list[str]:
+def lines(total, done, every_s):
     clock, stream = Clock(), io.StringIO()
     with Progress("training", total, "step", done, stream=stream, clock=clock) as progress:
         for k in range(done, total):
@@ -45,17 +45,17 @@ def lines(total: int, done: int, every_s: float) -> list[str]:
     return stream.getvalue().splitlines()
 
 
-def test_a_line_every_five_seconds_where_there_is_no_terminal() -> None:
+def test_a_line_every_five_seconds_where_there_is_no_terminal():
     shown = lines(40, 0, 1.0)
     assert len(shown) == 8
     assert shown[0] == "edgeslam: training, 5 of 40 steps, 1.0 steps/s, 35 s left, loss 4"
 
 
-def test_what_was_done_before_is_no_part_of_the_rate() -> None:
+def test_what_was_done_before_is_no_part_of_the_rate():
     assert re.search(r"91 of 100 steps, 0\.2 steps/s, 45 s left", lines(100, 90, 5.0)[0])
 
 
-def test_slow_work_is_not_repeated_word_for_word() -> None:
+def test_slow_work_is_not_repeated_word_for_word():
     clock, stream = Clock(), io.StringIO()
     with Progress("last refinement", stream=stream, clock=clock) as progress:
         for _ in range(10):
@@ -65,7 +65,7 @@ def test_slow_work_is_not_repeated_word_for_word() -> None:
 
 
 @pytest.mark.parametrize("columns", [0, 30, 200])
-def test_a_terminal_of_any_width_gets_one_line_that_fits(columns: int) -> None:
+def test_a_terminal_of_any_width_gets_one_line_that_fits(columns):
     master, slave = pty.openpty()
     fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
     with os.fdopen(slave, "w", encoding="utf-8") as terminal, Progress("深度 " * 30, stream=terminal) as progress:
@@ -77,7 +77,7 @@ def test_a_terminal_of_any_width_gets_one_line_that_fits(columns: int) -> None:
     assert sum(2 if c in "深度" else 1 for c in shown[1:]) < (columns or 80)
 
 
-def test_messages_take_the_line_away_and_do_not_mix_with_it() -> None:
+def test_messages_take_the_line_away_and_do_not_mix_with_it():
     stream = io.StringIO()
     console = Console(stream)
     stream.isatty = lambda: True
@@ -92,18 +92,18 @@ def test_messages_take_the_line_away_and_do_not_mix_with_it() -> None:
     assert stream.getvalue().count("flying") == 2
 
 
-def render(text: str) -> list[str]:
+def render(text):
     """What a terminal would show."""
     rows = []
     for row in text.split("\n"):
-        cells: list[str] = []
+        cells = []
         for part in row.split("\r"):
             cells[: len(part)] = part
         rows.append("".join(cells).rstrip())
     return rows
 
 
-def test_work_within_work_is_shown_alone() -> None:
+def test_work_within_work_is_shown_alone():
     stream = io.StringIO()
     with Progress("outer", redraw=True, stream=stream) as outer:
         with Progress("inner", redraw=True, stream=stream) as inner:
@@ -114,25 +114,25 @@ def test_work_within_work_is_shown_alone() -> None:
         assert "outer" in stream.getvalue()
 
 
-def test_other_processes_of_a_group_are_silent() -> None:
+def test_other_processes_of_a_group_are_silent():
     stream = io.StringIO()
     with Progress("training", redraw=True, shown=False, stream=stream) as progress:
         progress.show()
     assert stream.getvalue() == ""
 
 
-def test_a_closed_terminal_does_not_end_the_work() -> None:
+def test_a_closed_terminal_does_not_end_the_work():
     stream = io.StringIO()
     stream.write = lambda text: (_ for _ in ()).throw(OSError(errno.EIO, "gone"))
     with Progress("work", redraw=True, stream=stream) as progress:
         progress.show()
 
 
-def test_counted_gives_the_items() -> None:
+def test_counted_gives_the_items():
     assert list(counted(["a", "b"], "reading", "image")) == ["a", "b"]
 
 
-def test_downloads_are_told_in_megabytes() -> None:
+def test_downloads_are_told_in_megabytes():
     clock = Clock()
     with Progress("file", unit="MB", stream=io.StringIO(), clock=clock) as progress:
         clock.now += 2.0
@@ -142,7 +142,7 @@ def test_downloads_are_told_in_megabytes() -> None:
         assert progress.text() == "file, 3.0 MB, 1.5 MB/s"
 
 
-def test_a_run_tells_frames_pose_way_and_the_last_refinement() -> None:
+def test_a_run_tells_frames_pose_way_and_the_last_refinement():
     slam, image = FakeSlam(), np.full((4, 4), 9, np.uint8)
     with RunProgress("opening") as progress:
         for i in range(3):

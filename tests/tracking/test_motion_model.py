@@ -6,14 +6,14 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.tracking.motion_model import MotionModel
 
 
-def at(x: float) -> np.ndarray:
+def at(x):
     """``T_c_w`` of a camera at ``x`` on the world's first axis."""
     T = np.eye(4)
     T[0, 3] = -x
     return T
 
 
-def moving() -> MotionModel:
+def moving():
     """At 1 at 10 s, at 1.5 at 10.5 s."""
     model = MotionModel(at(1.0))
     model.stamp_s = 10.0

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from edgeslam_torch.train.callbacks import ProgressBar, TensorBoard
 from edgeslam_torch.train.hooks import Hooks
 from edgeslam_torch.train.recipe import train
 from edgeslam_torch.train.signals import Source, Supervised
-from edgeslam_torch.train.state import TrainConfig, TrainState
+from edgeslam_torch.train.state import TrainConfig
 from edgeslam_torch.train.views.augment import View
 
 VIEW = View(
@@ -28,24 +27,22 @@ CONFIG = TrainConfig(steps=9, batch=1, warmup_steps=1, validate_every=3, checkpo
 class _Killed(Hooks):
     """Ends like a killed process: the last steps are not saved."""
 
-    def __init__(self, step: int) -> None:
+    def __init__(self, step):
         self.step = step
 
-    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+    def on_step(self, state, losses):
         if state.step == self.step:
             state.shown = None  # what a rescue would need
             raise KeyboardInterrupt
 
 
-def run(out: Path, config: TrainConfig, *more: Hooks) -> TrainState:
+def run(out, config, *more):
     hooks = [ProgressBar(), TensorBoard(out / "tensorboard", METADATA, [VIEW]), *more]
     signal = Supervised([Source("made", [VIEW], 1.0)], METADATA)
     return train(small_depth(), METADATA, [signal], config, out, lambda n: {"score": 1.0}, hooks)
 
 
-def test_steps_are_in_tensorboard_once_after_interrupts_and_more_steps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_steps_are_in_tensorboard_once_after_interrupts_and_more_steps(tmp_path, monkeypatch):
     # Files of one second are read in the order of their names, where a counter of the process puts 10 before 9; runs
     # of their own have seconds of their own.
     monkeypatch.setattr(event_file_writer, "_global_uid", event_file_writer.AtomicCounter(1000))

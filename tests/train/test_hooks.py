@@ -12,12 +12,10 @@ from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.train import (
     Data,
     DepthFolder,
-    Drawn,
     Hooks,
     Source,
     Supervised,
     TrainConfig,
-    TrainState,
     View,
     finetune,
     named_hooks,
@@ -34,7 +32,7 @@ CONFIG = TrainConfig(steps=4, batch=2, warmup_steps=1, validate_every=2, checkpo
 EXAMPLES = Path(__file__).parents[2] / "examples" / "training_hooks.py"
 
 
-def run(out: Path, *hooks: Hooks, config: TrainConfig = CONFIG) -> TrainState:
+def run(out, *hooks, config=CONFIG):
     signal = Supervised([Source("made", [VIEW], 1.0)], METADATA)
     return train(small_depth(), METADATA, [signal], config, out, lambda n: {"score": 1.0, "abs_rel": 0.3}, hooks)
 
@@ -42,50 +40,50 @@ def run(out: Path, *hooks: Hooks, config: TrainConfig = CONFIG) -> TrainState:
 class Diary(Hooks):
     """What happens, in order."""
 
-    def __init__(self) -> None:
-        self.seen: list[str] = []
+    def __init__(self):
+        self.seen = []
 
-    def on_start(self, state: TrainState, config: TrainConfig) -> None:
+    def on_start(self, state, config):
         self.seen.append("start")
 
-    def on_losses(self, state: TrainState, drawn: Drawn) -> None:
+    def on_losses(self, state, drawn):
         assert drawn.signal == "supervised"
         assert drawn.batch["image"].shape == (2, 3, 32, 64)
         assert drawn.predicted.log_depth.shape == (2, 1, 32, 64) and drawn.predicted.log_depth.requires_grad
         self.seen.append("losses " + ",".join(drawn.losses))
 
-    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+    def on_step(self, state, losses):
         self.seen.append(f"step {state.step}")
 
-    def on_validation(self, state: TrainState, metrics: dict[str, float]) -> None:
+    def on_validation(self, state, metrics):
         self.seen.append(f"validation {metrics['score']:g}")
 
-    def on_end(self, state: TrainState, reason: str) -> None:
+    def on_end(self, state, reason):
         self.seen.append(f"end: {reason}")
 
-    def close(self) -> None:
+    def close(self):
         self.seen.append("close")
 
 
 class Zero(Hooks):
     """Nothing is learnt but what it says."""
 
-    def on_losses(self, state: TrainState, drawn: Drawn) -> None:
+    def on_losses(self, state, drawn):
         for name in list(drawn.losses):
             del drawn.losses[name]
         drawn.losses["own"] = (drawn.predicted.log_depth - 1.0).square().flatten(1).mean(1)
 
 
 class StopAt(Hooks):
-    def __init__(self, step: int) -> None:
+    def __init__(self, step):
         self.step = step
 
-    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+    def on_step(self, state, losses):
         if state.step == self.step:
             state.stop = "seen enough"
 
 
-def test_events_come_in_the_order_that_is_written_down(tmp_path: Path) -> None:
+def test_events_come_in_the_order_that_is_written_down(tmp_path):
     diary = Diary()
     run(tmp_path, diary)
     step = "losses l1,gradient,uncertainty"
@@ -93,17 +91,17 @@ def test_events_come_in_the_order_that_is_written_down(tmp_path: Path) -> None:
     assert diary.seen == ["start", *two[0], "validation 1", *two[1], "validation 1", "end: all steps done", "close"]
 
 
-def test_hook_that_only_watches_changes_nothing(tmp_path: Path) -> None:
+def test_hook_that_only_watches_changes_nothing(tmp_path):
     alone, watched = run(tmp_path / "a"), run(tmp_path / "b", Diary())
     for a, b in zip(alone.network.parameters(), watched.network.parameters(), strict=True):
         assert torch.equal(a, b)
 
 
-def test_own_loss_is_what_is_learnt_and_reported(tmp_path: Path) -> None:
-    losses: list[dict[str, float]] = []
+def test_own_loss_is_what_is_learnt_and_reported(tmp_path):
+    losses = []
 
     class Keep(Hooks):
-        def on_step(self, state: TrainState, given: dict[str, float]) -> None:
+        def on_step(self, state, given):
             losses.append(given)
 
     run(tmp_path, Zero(), Keep(), config=replace(CONFIG, steps=12, lr=0.05, batch=1))
@@ -115,10 +113,10 @@ def test_own_loss_is_what_is_learnt_and_reported(tmp_path: Path) -> None:
     ("value", "words"),
     [(torch.tensor(1.0), r"of shape \(\)"), (torch.ones(2, 1), r"of shape \(2, 1\)"), (1.0, "a float")],
 )
-def test_loss_that_is_not_one_value_an_image_is_said(tmp_path: Path, value: object, words: str) -> None:
+def test_loss_that_is_not_one_value_an_image_is_said(tmp_path, value, words):
     class Wrong(Hooks):
-        def on_losses(self, state: TrainState, drawn: Drawn) -> None:
-            drawn.losses["own"] = value  # type: ignore[assignment]
+        def on_losses(self, state, drawn):
+            drawn.losses["own"] = value
 
     with pytest.raises(
         ConfigError, match=rf"hook Wrong: loss 'own' must be one value an image, \(2,\), and is {words}"
@@ -126,7 +124,7 @@ def test_loss_that_is_not_one_value_an_image_is_said(tmp_path: Path, value: obje
         run(tmp_path, Wrong())
 
 
-def test_stop_is_validated_saved_and_said(tmp_path: Path) -> None:
+def test_stop_is_validated_saved_and_said(tmp_path):
     diary = Diary()
     state = run(tmp_path, StopAt(3), diary)
     assert diary.seen[-4:] == ["step 3", "validation 1", "end: seen enough", "close"]
@@ -137,10 +135,10 @@ def test_stop_is_validated_saved_and_said(tmp_path: Path) -> None:
     assert again.seen[2] == "step 4"
 
 
-def test_fine_tuning_calls_hooks_and_is_not_resumed_with_other_losses(tmp_path: Path) -> None:
+def test_fine_tuning_calls_hooks_and_is_not_resumed_with_other_losses(tmp_path):
     data = Data(labelled=[DepthFolder("kitchen", (VIEW,) * 3, ())])
 
-    def tune(*hooks: Hooks, steps: int = 2) -> int:
+    def tune(*hooks, steps=2):
         with out_folder(tmp_path / "out") as out:
             return finetune(small_depth(), METADATA, data, replace(CONFIG, steps=steps), out, hooks=hooks).steps
 
@@ -150,7 +148,7 @@ def test_fine_tuning_calls_hooks_and_is_not_resumed_with_other_losses(tmp_path: 
         tune(Zero(), steps=4)
 
 
-def test_hooks_are_found_in_files_and_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hooks_are_found_in_files_and_modules(tmp_path, monkeypatch):
     (tmp_path / "my_hooks_here.py").write_text(
         "from edgeslam_torch.train import Hooks\n"
         "class Mine(Hooks):\n    def __init__(self, word='default'): self.word = word\n"
@@ -159,7 +157,7 @@ def test_hooks_are_found_in_files_and_modules(tmp_path: Path, monkeypatch: pytes
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", ["/nowhere"])
     found = named_hooks(["my_hooks_here.py:Mine", "my_hooks_here:named", f"{tmp_path}/my_hooks_here.py:named"])
-    assert [hook.word for hook in found] == ["default", "named", "named"]  # type: ignore[attr-defined]
+    assert [hook.word for hook in found] == ["default", "named", "named"]
 
 
 @pytest.mark.parametrize(
@@ -175,9 +173,7 @@ def test_hooks_are_found_in_files_and_modules(tmp_path: Path, monkeypatch: pytes
         ("good.py:number", "is no edgeslam_torch.train.Hooks"),
     ],
 )
-def test_hook_that_is_none_is_an_error_of_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, words: str
-) -> None:
+def test_hook_that_is_none_is_an_error_of_one_line(tmp_path, monkeypatch, name, words):
     monkeypatch.chdir(tmp_path)
     Path("broken.py").write_text("1 / 0")
     Path("good.py").write_text(
@@ -189,11 +185,11 @@ def test_hook_that_is_none_is_an_error_of_one_line(
     assert str(error.value).startswith(f"--hook {name}: ")
 
 
-def test_examples_do_what_they_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_do_what_they_say(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = ("OwnLoss", "CsvLog", "SampleImages", "stop")
     hooks = named_hooks([f"{EXAMPLES}:{name}" for name in names])
-    hooks[2].every, hooks[3].metric, hooks[3].below = 2, "abs_rel", 0.4  # type: ignore[attr-defined]
+    hooks[2].every, hooks[3].metric, hooks[3].below = 2, "abs_rel", 0.4
     state = run(tmp_path / "out", *hooks)
     assert (state.step, state.stop) == (2, "abs_rel is below 0.4")
     rows = [row.split(",") for row in Path("losses.csv").read_text().split()]

@@ -3,7 +3,6 @@
 import importlib.util
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
@@ -19,7 +18,7 @@ METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
 
 
 @pytest.fixture(scope="module")
-def example() -> ModuleType:
+def example():
     spec = importlib.util.spec_from_file_location("own_training_loop", SCRIPT)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -27,7 +26,7 @@ def example() -> ModuleType:
     return module
 
 
-def test_pairs_show_the_points_where_they_are(example: ModuleType, run_folder: Path) -> None:
+def test_pairs_show_the_points_where_they_are(example, run_folder):
     run = load_run(run_folder)
     pairs = example.Pairs(run, METADATA)
     assert len(pairs) == len(run.usable)
@@ -40,13 +39,7 @@ def test_pairs_show_the_points_where_they_are(example: ModuleType, run_folder: P
     assert float(sample["K"][0, 0]) == pytest.approx(CAMERA.fx)
 
 
-def test_loop_trains_and_writes_weights(
-    example: ModuleType,
-    run_folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_loop_trains_and_writes_weights(example, run_folder, tmp_path, monkeypatch, capsys):
     torch.manual_seed(0)
     network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
     save_checkpoint(network, METADATA, tmp_path / "start.safetensors")

@@ -1,13 +1,11 @@
 """A network that is not FastDepth learns from labels and from a run, and what it learnt flies as an ONNX file."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 import torch
 from depth_folder import write_folder
-from torch import Tensor, nn
+from torch import nn
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.frontend.depth_network import open_depth
@@ -16,16 +14,7 @@ from edgeslam_torch.models.checkpoint import restored, save_checkpoint
 from edgeslam_torch.models.onnx.export import ExportOptions, export_onnx
 from edgeslam_torch.models.record import OTHER_NETWORK, Metadata
 from edgeslam_torch.models.trainable import DepthModule, Prediction
-from edgeslam_torch.train import (
-    Data,
-    Existing,
-    TrainConfig,
-    TrainingResult,
-    finetune,
-    load_depth_folder,
-    load_run,
-    out_folder,
-)
+from edgeslam_torch.train import Data, Existing, TrainConfig, finetune, load_depth_folder, load_run, out_folder
 from edgeslam_torch.train.validate import score
 
 METADATA = Metadata(
@@ -39,23 +28,23 @@ CONFIG = TrainConfig(
 class Rows(DepthModule):
     """Depth by row of the image, plus what a convolution of its pixels says: no encoder, no batch norm."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.line = nn.Parameter(torch.linspace(-1.5, 1.5, 8).view(1, 1, 8, 1))
         self.layer = nn.Conv2d(3, 1, 3, padding=1)
         nn.init.zeros_(self.layer.weight)
 
-    def predict(self, x: Tensor) -> Prediction:
+    def predict(self, x):
         line = nn.functional.interpolate(self.line, size=x.shape[-2:], mode="bilinear", align_corners=True)
         return Prediction(line + self.layer(x), None)
 
 
-def taught(network: DepthModule, data: Data, out: Path) -> TrainingResult:
+def taught(network, data, out):
     with out_folder(out, Existing.SAME) as folder:
         return finetune(network, METADATA, data, CONFIG, folder)
 
 
-def test_another_network_learns_from_labels_and_is_restored_from_the_best_file(tmp_path: Path) -> None:
+def test_another_network_learns_from_labels_and_is_restored_from_the_best_file(tmp_path):
     labelled = load_depth_folder(write_folder(tmp_path / "hall"))
     torch.manual_seed(0)
     network = Rows()
@@ -70,7 +59,7 @@ def test_another_network_learns_from_labels_and_is_restored_from_the_best_file(t
     )
 
 
-def test_another_network_learns_from_a_run_by_the_sweep(run_folder: Path, tmp_path: Path) -> None:
+def test_another_network_learns_from_a_run_by_the_sweep(run_folder, tmp_path):
     """Nothing but poses and map points: the network's own depth only fills what the sweep leaves open."""
     torch.manual_seed(0)
     outcome = taught(Rows(), Data(posed=[load_run(run_folder)]), tmp_path / "out")
@@ -78,7 +67,7 @@ def test_another_network_learns_from_a_run_by_the_sweep(run_folder: Path, tmp_pa
     assert outcome.kept.abs_rel_scaled < 0.6 * outcome.before.abs_rel_scaled
 
 
-def test_another_network_is_exported_and_flies(tmp_path: Path) -> None:
+def test_another_network_is_exported_and_flies(tmp_path):
     torch.manual_seed(0)
     network = Rows()
     nn.init.normal_(network.layer.weight, std=0.05)
@@ -92,12 +81,12 @@ def test_another_network_is_exported_and_flies(tmp_path: Path) -> None:
     np.testing.assert_allclose(depth.sigma_log, 0.2, rtol=1e-5)
 
 
-def _normalised(image: np.ndarray) -> np.ndarray:
+def _normalised(image):
     rgb = image[..., ::-1].astype(np.float32) / 255.0
     return np.ascontiguousarray(((rgb - 0.5) / 0.5).transpose(2, 0, 1))[None]
 
 
-def test_tensors_of_another_network_are_refused(tmp_path: Path) -> None:
+def test_tensors_of_another_network_are_refused(tmp_path):
     save_checkpoint(Rows(), METADATA, tmp_path / "w.safetensors")
     with pytest.raises(WeightsError, match="of another network"):
         restored(nn.Conv2d(3, 1, 3), tmp_path / "w.safetensors")

@@ -7,7 +7,6 @@ import signal as signal_number
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,21 +15,19 @@ import pytest
 import torch
 from small_depth import METADATA, SmallDepth
 from small_depth import small_depth as network
-from torch import Tensor
 
 from edgeslam_torch.errors import ConfigError, SourceError, WeightsError
 from edgeslam_torch.models.checkpoint import build_network
-from edgeslam_torch.models.fastdepth import Prediction, Variant, Widths
-from edgeslam_torch.models.trainable import DepthModule
+from edgeslam_torch.models.fastdepth import Variant, Widths
 from edgeslam_torch.models.weights_file import read_header
 from edgeslam_torch.train import recipe
 from edgeslam_torch.train import state as state_file
-from edgeslam_torch.train.hooks import Drawn, Hooks
+from edgeslam_torch.train.hooks import Hooks
 from edgeslam_torch.train.processes.device import Arithmetic
 from edgeslam_torch.train.processes.loading import WorkerError
 from edgeslam_torch.train.recipe import DivergedError, NonFiniteLossError, learning_rate_factor, train
 from edgeslam_torch.train.signals import Slot, Source, Supervised, SupervisedWeights
-from edgeslam_torch.train.state import TrainConfig, TrainState, saved_step
+from edgeslam_torch.train.state import TrainConfig, saved_step
 from edgeslam_torch.train.validate import image_tensor
 from edgeslam_torch.train.views.augment import AugmentConfig, View
 
@@ -38,46 +35,46 @@ CONFIG = TrainConfig(steps=6, batch=4, warmup_steps=2, validate_every=3, checkpo
 STILL = AugmentConfig(0, (1, 1), 0, 0, 0, 0, 0, 0, 0, 0, (1, 1), 0, 0, 0)
 
 
-def views(count: int = 3) -> list[View]:
+def views(count=3):
     rng = np.random.default_rng(0)
     K = np.array([[50.0, 0, 31.5], [0, 50.0, 15.5], [0, 0, 1]])
     depth = np.linspace(1, 4, 64, dtype=np.float32)[None].repeat(32, 0)
     return [View(rng.integers(0, 256, (32, 64, 3), np.uint8), depth + i, K) for i in range(count)]
 
 
-def signal(augment: AugmentConfig | None = None) -> Supervised:
+def signal(augment=None):
     return Supervised([Source("made", views(), 1.0)], METADATA, augment or AugmentConfig())
 
 
-def run(out: Path, config: TrainConfig = CONFIG, hooks: Sequence[Hooks] = ()) -> TrainState:
+def run(out, config=CONFIG, hooks=()):
     return train(network(), METADATA, [signal()], config, out, lambda n: {"score": 1.0}, hooks)
 
 
 class _SnapshotAt(Hooks):
     """The state after a SIGKILL between two steps."""
 
-    def __init__(self, step: int, folder: Path, snapshot: Path) -> None:
+    def __init__(self, step, folder, snapshot):
         self.step, self.folder, self.snapshot = step, folder, snapshot
 
-    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+    def on_step(self, state, losses):
         if state.step == self.step:
             shutil.copytree(self.folder, self.snapshot)
 
 
 class _RaiseAt(Hooks):
-    def __init__(self, step: int, error: BaseException) -> None:
+    def __init__(self, step, error):
         self.step, self.error = step, error
         self.closed = False
 
-    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+    def on_step(self, state, losses):
         if state.step == self.step:
             raise self.error
 
-    def close(self) -> None:
+    def close(self):
         self.closed = True
 
 
-def assert_same(whole: TrainState, other: TrainState) -> None:
+def assert_same(whole, other):
     assert other.step == whole.step
     for mine, theirs in ((whole.network, other.network), (whole.averaged, other.averaged)):
         for (name, a), b in zip(mine.state_dict().items(), theirs.state_dict().values(), strict=True):
@@ -87,7 +84,7 @@ def assert_same(whole: TrainState, other: TrainState) -> None:
 
 
 @pytest.fixture(scope="module")
-def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def killed(tmp_path_factory):
     """Folders ``step1`` to ``step6`` as they were after each step of one run."""
     folder = tmp_path_factory.mktemp("killed")
     run(folder / "whole", hooks=[_SnapshotAt(i, folder / "whole", folder / f"step{i}") for i in range(1, 7)])
@@ -95,18 +92,18 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> TrainState:
+def whole(tmp_path_factory):
     """The end of a run that nothing disturbed; not to be changed."""
     return run(tmp_path_factory.mktemp("whole"))
 
 
 @pytest.mark.parametrize("step", [1, 2, 3, 6])
-def test_killed_and_resumed_run_ends_with_the_same_weights(whole: TrainState, killed: Path, step: int) -> None:
+def test_killed_and_resumed_run_ends_with_the_same_weights(whole, killed, step):
     assert_same(whole, run(killed / f"step{step}"))
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("a broken hook")])
-def test_interrupt_and_broken_hook_lose_no_step(whole: TrainState, tmp_path: Path, error: BaseException) -> None:
+def test_interrupt_and_broken_hook_lose_no_step(whole, tmp_path, error):
     hook = _RaiseAt(5, error)
     with pytest.raises(type(error)):
         run(tmp_path / "stopped", hooks=[hook])
@@ -115,8 +112,8 @@ def test_interrupt_and_broken_hook_lose_no_step(whole: TrainState, tmp_path: Pat
     assert_same(whole, run(tmp_path / "stopped"))
 
 
-def test_interrupt_in_the_validation_is_validated_after_the_resume(whole: TrainState, tmp_path: Path) -> None:
-    def interrupted(_: DepthModule) -> dict[str, float]:
+def test_interrupt_in_the_validation_is_validated_after_the_resume(whole, tmp_path):
+    def interrupted(_):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -125,13 +122,11 @@ def test_interrupt_in_the_validation_is_validated_after_the_resume(whole: TrainS
     assert_same(whole, run(tmp_path / "stopped"))
 
 
-def test_interrupt_between_two_weights_of_a_step_saves_the_step_before(
-    whole: TrainState, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupt_between_two_weights_of_a_step_saves_the_step_before(whole, tmp_path, monkeypatch):
     steps = []
     real = torch.optim.AdamW.step
 
-    def interrupted(self: torch.optim.AdamW, *args: object) -> object:
+    def interrupted(self, *args):
         steps.append(real(self, *args))
         if len(steps) == 4:
             raise KeyboardInterrupt
@@ -145,12 +140,12 @@ def test_interrupt_between_two_weights_of_a_step_saves_the_step_before(
     assert_same(whole, run(tmp_path / "stopped"))
 
 
-def test_full_disk_keeps_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
+def test_full_disk_keeps_the_checkpoint_before(tmp_path, monkeypatch):
+    def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     class FullAt3(Hooks):
-        def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+        def on_step(self, state, losses):
             if state.step == 3:
                 monkeypatch.setattr(state_file, "write_atomically", full)
 
@@ -161,7 +156,7 @@ def test_full_disk_keeps_the_checkpoint_before(tmp_path: Path, monkeypatch: pyte
     assert run(tmp_path).step == 6
 
 
-def test_more_steps_go_on_where_fewer_ended(tmp_path: Path) -> None:
+def test_more_steps_go_on_where_fewer_ended(tmp_path):
     run(tmp_path)
     state = run(tmp_path, replace(CONFIG, steps=9))
     assert state.step == 9
@@ -170,7 +165,7 @@ def test_more_steps_go_on_where_fewer_ended(tmp_path: Path) -> None:
         run(tmp_path, replace(CONFIG, steps=8))
 
 
-def test_learning_rate_after_a_resume_is_the_one_asked_for(tmp_path: Path) -> None:
+def test_learning_rate_after_a_resume_is_the_one_asked_for(tmp_path):
     run(tmp_path)
     slower = replace(CONFIG, steps=9, lr=1e-5, encoder_lr=2e-6, lr_end=1.0)
     state = run(tmp_path, slower)
@@ -178,19 +173,19 @@ def test_learning_rate_after_a_resume_is_the_one_asked_for(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("content", [b"", b"no torch file", b"PK\x03\x04 cut off"])
-def test_damaged_state_is_named(tmp_path: Path, content: bytes) -> None:
+def test_damaged_state_is_named(tmp_path, content):
     (tmp_path / "last.pt").write_bytes(content)
     with pytest.raises(WeightsError, match=r"last\.pt: damaged"):
         run(tmp_path)
 
 
-def test_state_of_another_network_is_named(tmp_path: Path) -> None:
+def test_state_of_another_network_is_named(tmp_path):
     run(tmp_path)
     with pytest.raises(WeightsError, match=r"last\.pt: .*another network"):
         train(SmallDepth(width=16), METADATA, [signal()], CONFIG, tmp_path)
 
 
-def test_finished_run_is_not_trained_further(tmp_path: Path) -> None:
+def test_finished_run_is_not_trained_further(tmp_path):
     run(tmp_path)
     before = (tmp_path / "final.safetensors").read_bytes()
     assert run(tmp_path).step == 6
@@ -199,11 +194,11 @@ def test_finished_run_is_not_trained_further(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_batch_is_learnt_almost_to_zero(tmp_path: Path) -> None:
-    losses: list[float] = []
+def test_one_batch_is_learnt_almost_to_zero(tmp_path):
+    losses = []
 
     class Record(Hooks):
-        def on_step(self, state: TrainState, named: dict[str, float]) -> None:
+        def on_step(self, state, named):
             losses.append(named["supervised/l1"])
 
     weights = SupervisedWeights(uncertainty=0.0, gradient=0.1)
@@ -221,11 +216,11 @@ class _PoisonedAt(Supervised):
 
     step, image = 0, 2
 
-    def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
+    def draw(self, slots):
         self.poisoned = slots[0].step >= self.step
         return super().draw(slots)
 
-    def losses(self, predicted: Prediction, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    def losses(self, predicted, batch):
         found = super().losses(predicted, batch)
         found["l1"] = found["l1"].clone()
         if self.poisoned:
@@ -234,7 +229,7 @@ class _PoisonedAt(Supervised):
 
 
 @pytest.mark.parametrize(("step", "kept"), [(0, "nothing was saved"), (5, "last.pt holds step 4, the last good one")])
-def test_not_finite_loss_stops_and_names_the_images(tmp_path: Path, step: int, kept: str) -> None:
+def test_not_finite_loss_stops_and_names_the_images(tmp_path, step, kept):
     poisoned = _PoisonedAt([Source("made", views(), 1.0)], METADATA)
     poisoned.step = step
     named = poisoned.describe([Slot(0, step, 2)])[0]
@@ -247,10 +242,10 @@ def test_not_finite_loss_stops_and_names_the_images(tmp_path: Path, step: int, k
 class _ExplodeAt(Hooks):
     """What a learning rate far too large does, at a chosen step."""
 
-    def __init__(self, step: int, factor: float) -> None:
+    def __init__(self, step, factor):
         self.step, self.factor = step, factor
 
-    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+    def on_step(self, state, losses):
         if state.step == self.step:
             with torch.no_grad():
                 for parameter in state.network.parameters():
@@ -258,16 +253,14 @@ class _ExplodeAt(Hooks):
 
 
 @pytest.fixture(scope="module")
-def longer(tmp_path_factory: pytest.TempPathFactory) -> tuple[TrainConfig, TrainState]:
+def longer(tmp_path_factory):
     """A run of eight steps and its end."""
     config = replace(CONFIG, steps=8)
     return config, run(tmp_path_factory.mktemp("longer"), config)
 
 
 @pytest.mark.parametrize(("factor", "step"), [(1e3, 5), (1e30, 4), (torch.nan, 5)])
-def test_last_state_is_a_working_network_after_a_divergence(
-    longer: tuple[TrainConfig, TrainState], tmp_path: Path, factor: float, step: int
-) -> None:
+def test_last_state_is_a_working_network_after_a_divergence(longer, tmp_path, factor, step):
     config, whole = longer
     with pytest.raises(DivergedError, match=r"last\.pt holds step [24], the last good one"):
         run(tmp_path, config, hooks=[_ExplodeAt(step, factor)])
@@ -275,7 +268,7 @@ def test_last_state_is_a_working_network_after_a_divergence(
     assert_same(whole, run(tmp_path, config))
 
 
-def test_interrupt_after_an_explosion_saves_no_ruin(tmp_path: Path) -> None:
+def test_interrupt_after_an_explosion_saves_no_ruin(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, hooks=[_ExplodeAt(3, 1e30), _RaiseAt(3, KeyboardInterrupt())])
     assert saved_step(tmp_path / "last.pt") == 2
@@ -284,40 +277,34 @@ def test_interrupt_after_an_explosion_saves_no_ruin(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "wrong", [{"lr": 0.0}, {"lr": float("nan")}, {"encoder_lr": 2.0}, {"batch": 0}, {"seed": -1}, {"accumulate": 5}]
 )
-def test_settings_that_cannot_train_are_refused(wrong: dict[str, float]) -> None:
+def test_settings_that_cannot_train_are_refused(wrong):
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} must"):
         replace(CONFIG, **wrong)
 
 
-def test_only_what_beats_the_weights_before_is_the_best(tmp_path: Path) -> None:
+def test_only_what_beats_the_weights_before_is_the_best(tmp_path):
     scores = iter([0.6, 0.7])
     state = train(
-        network(),
-        METADATA,
-        [signal()],
-        CONFIG,
-        tmp_path,
-        lambda n: {"score": next(scores)},
-        before={"score": 0.5},
+        network(), METADATA, [signal()], CONFIG, tmp_path, lambda n: {"score": next(scores)}, before={"score": 0.5}
     )
     assert (state.best, state.best_step, state.stale) == (0.5, 0, 2)
     assert not (tmp_path / "best.safetensors").exists()
     assert [row["step"] for row in state.history] == [0, 3, 6]
 
 
-def test_stopped_early_means_stopped_after_a_resume_too(tmp_path: Path) -> None:
+def test_stopped_early_means_stopped_after_a_resume_too(tmp_path):
     config = replace(CONFIG, steps=50, validate_every=1, patience=2)
     for _ in range(2):
         state = train(network(), METADATA, [signal()], config, tmp_path, lambda n: {"score": 1.0})
         assert state.step == 3
 
 
-def test_early_stopping_counts_validations_without_progress(tmp_path: Path) -> None:
+def test_early_stopping_counts_validations_without_progress(tmp_path):
     scores = iter([1.0, 0.5, 0.6, 0.7, 0.4])
-    ended: list[str] = []
+    ended = []
 
     class Record(Hooks):
-        def on_end(self, state: TrainState, reason: str) -> None:
+        def on_end(self, state, reason):
             ended.append(reason)
 
     config = replace(CONFIG, steps=50, validate_every=1, patience=2)
@@ -327,7 +314,7 @@ def test_early_stopping_counts_validations_without_progress(tmp_path: Path) -> N
     assert ended == ["no improvement in 2 validations"]
 
 
-def test_frozen_parts_do_not_move_and_their_statistics_neither(tmp_path: Path) -> None:
+def test_frozen_parts_do_not_move_and_their_statistics_neither(tmp_path):
     before = network().state_dict()
     config = replace(CONFIG, frozen_stages=1, freeze_norm=True)
     after = train(network(), METADATA, [signal()], config, tmp_path).network.state_dict()
@@ -338,7 +325,7 @@ def test_frozen_parts_do_not_move_and_their_statistics_neither(tmp_path: Path) -
     assert not torch.equal(before["head.weight"], after["head.weight"])
 
 
-def test_learning_rate_rises_then_falls() -> None:
+def test_learning_rate_rises_then_falls():
     factors = [learning_rate_factor(i, TrainConfig(steps=100, warmup_steps=10)) for i in range(100)]
     assert factors[0] == pytest.approx(0.1)
     assert max(factors) == factors[9] == pytest.approx(1.0)
@@ -390,17 +377,17 @@ with process_group():
 """
 
 
-def two_recordings() -> Supervised:
+def two_recordings():
     sources = [Source("first", views(3), 1.0), Source("second", views(5)[3:], 2.0)]
     return Supervised(sources, METADATA, AugmentConfig())
 
 
-def shared_config(frozen: bool) -> TrainConfig:
+def shared_config(frozen):
     """Five images a step: three in one process, two in the other."""
     return replace(CONFIG, steps=20, batch=5, freeze_norm=frozen, checkpoint_every=20)
 
 
-def in_two_processes(script: str, *words: str) -> list[tuple[int, str]]:
+def in_two_processes(script, *words):
     """Exit code and stderr of each process of a group that runs a script."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -417,7 +404,7 @@ def in_two_processes(script: str, *words: str) -> list[tuple[int, str]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("norms", ["frozen", "learning"])
-def test_two_processes_on_two_recordings_give_the_single_process_result(tmp_path: Path, norms: str) -> None:
+def test_two_processes_on_two_recordings_give_the_single_process_result(tmp_path, norms):
     together = tmp_path / "together.pt"
     ended = in_two_processes(TWO_RECORDINGS, str(tmp_path / "b"), str(together), norms)
     assert [code for code, _ in ended] == [0, 0], ended
@@ -432,7 +419,7 @@ def test_two_processes_on_two_recordings_give_the_single_process_result(tmp_path
 
 
 @pytest.mark.parametrize("parts", [2, 5])
-def test_parts_of_a_batch_give_the_step_of_the_whole(tmp_path: Path, parts: int) -> None:
+def test_parts_of_a_batch_give_the_step_of_the_whole(tmp_path, parts):
     config = shared_config(frozen=True)
     whole = train(network(), METADATA, [two_recordings()], config, tmp_path / "whole").network.state_dict()
     divided = replace(config, accumulate=parts)
@@ -441,18 +428,18 @@ def test_parts_of_a_batch_give_the_step_of_the_whole(tmp_path: Path, parts: int)
         torch.testing.assert_close(state[name], value, rtol=1e-4, atol=1e-4, msg=name)
 
 
-def test_workers_draw_the_same_batches(whole: TrainState, tmp_path: Path) -> None:
+def test_workers_draw_the_same_batches(whole, tmp_path):
     assert_same(whole, run(tmp_path, replace(CONFIG, workers=2)))
 
 
 class _Unreadable(Supervised):
-    def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
+    def draw(self, slots):
         if slots[0].step == 3:
             raise SourceError("flight/3.png: unreadable")
         return super().draw(slots)
 
 
-def test_error_in_a_worker_is_that_error(tmp_path: Path) -> None:
+def test_error_in_a_worker_is_that_error(tmp_path):
     signals = [_Unreadable([Source("made", views(), 1.0)], METADATA)]
     with pytest.raises(SourceError, match=r"^flight/3\.png: unreadable$"):
         train(network(), METADATA, signals, replace(CONFIG, workers=1), tmp_path)
@@ -460,24 +447,22 @@ def test_error_in_a_worker_is_that_error(tmp_path: Path) -> None:
 
 
 class _KilledAt3(Supervised):
-    def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
+    def draw(self, slots):
         if slots[0].step == 3:
             os.kill(os.getpid(), signal_number.SIGKILL)
         return super().draw(slots)
 
 
-def test_killed_worker_ends_training_in_one_line_and_loses_no_step(whole: TrainState, tmp_path: Path) -> None:
+def test_killed_worker_ends_training_in_one_line_and_loses_no_step(whole, tmp_path):
     signals = [_KilledAt3([Source("made", views(), 1.0)], METADATA)]
     with pytest.raises(WorkerError, match=r"a process that draws batches ended \(.*\); fewer --workers take less"):
         train(network(), METADATA, signals, replace(CONFIG, workers=1), tmp_path, lambda n: {"score": 1.0})
     assert_same(whole, run(tmp_path))
 
 
-def test_interrupt_in_a_forward_pass_leaves_the_statistics_of_the_step_before(
-    whole: TrainState, tmp_path: Path
-) -> None:
+def test_interrupt_in_a_forward_pass_leaves_the_statistics_of_the_step_before(whole, tmp_path):
     class Interrupted(Hooks):
-        def on_losses(self, state: TrainState, drawn: Drawn) -> None:
+        def on_losses(self, state, drawn):
             if state.step == 4:
                 raise KeyboardInterrupt
 
@@ -488,27 +473,27 @@ def test_interrupt_in_a_forward_pass_leaves_the_statistics_of_the_step_before(
 
 
 @pytest.mark.parametrize("device", ["cuda", "mps"])
-def test_device_that_is_not_there_is_refused_in_one_line(tmp_path: Path, device: str) -> None:
+def test_device_that_is_not_there_is_refused_in_one_line(tmp_path, device):
     if (torch.cuda if device == "cuda" else torch.backends.mps).is_available():
         pytest.skip(f"{device} is there")
     with pytest.raises(ConfigError, match=f"--device {device}: this torch .* finds no such device; use --device cpu"):
         run(tmp_path, replace(CONFIG, device=device))
 
 
-def depth_of(state: TrainState) -> Tensor:
+def depth_of(state):
     """Log depth of the first view by what was learnt, on the processor."""
     with torch.no_grad():
         return state.averaged.cpu().eval().predict(image_tensor(views()[0].image, METADATA)[None]).log_depth
 
 
-def test_bfloat16_learns_the_same_as_float32(tmp_path: Path) -> None:
+def test_bfloat16_learns_the_same_as_float32(tmp_path):
     there, here = (depth_of(run(tmp_path / f"{amp}", replace(CONFIG, amp=amp))) for amp in (True, False))
     assert 0.0 < float((there - here).abs().mean()) < 0.06
 
 
 @pytest.mark.parametrize("device", ["cuda", "mps"])
 @pytest.mark.parametrize("amp", [False, True])
-def test_training_on_a_gpu_goes_on_anywhere(tmp_path: Path, device: str, amp: bool) -> None:
+def test_training_on_a_gpu_goes_on_anywhere(tmp_path, device, amp):
     if not (torch.cuda if device == "cuda" else torch.backends.mps).is_available():
         pytest.skip(f"no {device} device here")
     config = replace(CONFIG, device=device, amp=amp)
@@ -521,7 +506,7 @@ def test_training_on_a_gpu_goes_on_anywhere(tmp_path: Path, device: str, amp: bo
     assert run(tmp_path / "gpu", replace(CONFIG, steps=8)).step == 8, "a processor takes over"
 
 
-def test_float16_leaves_out_steps_that_overflow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_float16_leaves_out_steps_that_overflow(tmp_path, monkeypatch):
     """The first scale, 65536, is too large for these losses; the scaler halves it until it fits."""
     half = Arithmetic(torch.device("cpu"), torch.float16)
     monkeypatch.setattr(recipe, "arithmetic", lambda device, amp: half)
@@ -529,7 +514,7 @@ def test_float16_leaves_out_steps_that_overflow(tmp_path: Path, monkeypatch: pyt
     scales = []
 
     class Record(Hooks):
-        def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+        def on_step(self, state, losses):
             scales.append(state.scaler.get_scale())
 
     before = network().state_dict()
@@ -543,7 +528,7 @@ def test_float16_leaves_out_steps_that_overflow(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.slow
-def test_loss_that_is_not_finite_in_one_process_stops_all_with_its_name(tmp_path: Path) -> None:
+def test_loss_that_is_not_finite_in_one_process_stops_all_with_its_name(tmp_path):
     ended = in_two_processes(POISONED, str(tmp_path / "out"))
     named = Supervised([Source("made", views(), 1.0)], METADATA).describe([Slot(0, 3, 1)])[0]
     for code, said in ended:
@@ -553,7 +538,7 @@ def test_loss_that_is_not_finite_in_one_process_stops_all_with_its_name(tmp_path
 
 
 @pytest.mark.slow
-def test_stop_that_one_process_asks_for_ends_all_after_the_same_step(tmp_path: Path) -> None:
+def test_stop_that_one_process_asks_for_ends_all_after_the_same_step(tmp_path):
     for code, said in in_two_processes(STOPPED, str(tmp_path / "out")):
         assert code == 0
         assert "asked for by the second at 2" in said

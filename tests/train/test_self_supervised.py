@@ -1,10 +1,8 @@
 """Self-supervision from a SLAM run, on a rendered room with known poses and depth."""
 
 import json
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from unittest import mock
 
 import cv2
@@ -12,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from posed_run import CAMERA, FRAMES, world
-from torch import Tensor
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.models.checkpoint import build_network
@@ -24,18 +21,18 @@ from edgeslam_torch.train.signals import Slot
 from edgeslam_torch.train.teachers.teach import teach
 from edgeslam_torch.train.validate import metres_by
 from edgeslam_torch.train.views.junctions import junction_points, seen_cosines
-from edgeslam_torch.train.views.posed import PosedSequence, is_run_folder, load_run, visible_points
+from edgeslam_torch.train.views.posed import is_run_folder, load_run, visible_points
 from edgeslam_torch.train.views.straight import straight_edges
 
 METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
 
 
 @pytest.fixture(scope="module")
-def sequence(run_folder: Path) -> PosedSequence:
+def sequence(run_folder):
     return load_run(run_folder)
 
 
-def test_run_is_read_with_poses_points_and_partners(run_folder: Path, sequence: PosedSequence) -> None:
+def test_run_is_read_with_poses_points_and_partners(run_folder, sequence):
     assert is_run_folder(run_folder)
     assert not is_run_folder(run_folder.parent)
     assert len(sequence.views) == FRAMES - 1, "the lost frame is left out"
@@ -45,7 +42,7 @@ def test_run_is_read_with_poses_points_and_partners(run_folder: Path, sequence: 
     assert min(len(v.z) for v in sequence.views) > 100
 
 
-def test_missing_recording_is_named(run_folder: Path, tmp_path: Path) -> None:
+def test_missing_recording_is_named(run_folder, tmp_path):
     for name in ("trajectory.txt", "anchors.ply", "camera.yaml"):
         (tmp_path / name).write_bytes((run_folder / name).read_bytes())
     (tmp_path / "summary.json").write_text(json.dumps({"source": {"path": str(tmp_path / "gone")}}))
@@ -53,14 +50,14 @@ def test_missing_recording_is_named(run_folder: Path, tmp_path: Path) -> None:
         load_run(tmp_path)
 
 
-def test_visible_points_lie_on_the_seen_surfaces(sequence: PosedSequence) -> None:
+def test_visible_points_lie_on_the_seen_surfaces(sequence):
     view = sequence.views[4]
     depth = render(world(), CAMERA, view.T_w_c).depth_m
     expected = depth[np.rint(view.uv[:, 1]).astype(int), np.rint(view.uv[:, 0]).astype(int)]
     assert np.mean(np.abs(np.log(view.z / expected)) < 0.1) > 0.9
 
 
-def test_hidden_points_are_left_out() -> None:
+def test_hidden_points_are_left_out():
     T = np.eye(4)
     near = np.stack([np.linspace(-0.2, 0.2, 50), np.zeros(50), np.full(50, 1.0)], 1)
     uv, z = visible_points(np.concatenate([near, near * 3.0]).astype(np.float32), CAMERA.K, T, (96, 128))
@@ -72,17 +69,17 @@ def test_hidden_points_are_left_out() -> None:
 class _Oracle(torch.nn.Module):
     """Stub of a network: given log depths at the training focal length."""
 
-    def __init__(self, signal: SelfSupervised, slots: list[Slot], factor: float) -> None:
+    def __init__(self, signal, slots, factor):
         super().__init__()
         self.log = torch.stack([true_log_depth(signal, slot, which) for which in (0, 1) for slot in slots]) + float(
             np.log(factor)
         )
 
-    def predict(self, x: Tensor) -> Prediction:
+    def predict(self, x):
         return Prediction(self.log, torch.zeros_like(self.log))
 
 
-def true_log_depth(signal: SelfSupervised, slot: Slot, which: int) -> Tensor:
+def true_log_depth(signal, slot, which):
     """Rendered depth of what `draw` shows (zoom and flips are off)."""
     rng = slot.rng()
     s, i = signal._items[int(rng.integers(len(signal._items)))]
@@ -94,13 +91,13 @@ def true_log_depth(signal: SelfSupervised, slot: Slot, which: int) -> Tensor:
 
 
 @contextmanager
-def never_flipped() -> Iterator[None]:
+def never_flipped():
     """The loss is symmetric; the oracle above is not."""
     with mock.patch("edgeslam_torch.train.self_supervised.FLIP", 0.0):
         yield
 
 
-def test_every_term_is_smallest_at_the_true_depth(sequence: PosedSequence) -> None:
+def test_every_term_is_smallest_at_the_true_depth(sequence):
     signal = SelfSupervised([sequence], METADATA, zoom=(1.0, 1.0))
     slots = [Slot(0, 0, k) for k in range(2)]
     with never_flipped():
@@ -113,7 +110,7 @@ def test_every_term_is_smallest_at_the_true_depth(sequence: PosedSequence) -> No
 
 
 @pytest.mark.parametrize("k", range(2))
-def test_what_is_drawn_is_the_run_in_metres(sequence: PosedSequence, k: int) -> None:
+def test_what_is_drawn_is_the_run_in_metres(sequence, k):
     """Brought to metres, baselines and depths are twice as long; points lie where the zoom puts them."""
     slot = Slot(3, 0, k)
     batches = [SelfSupervised([sequence], METADATA, log_scale=[s]).draw([slot]) for s in (0.0, float(np.log(2.0)))]
@@ -135,7 +132,7 @@ def test_what_is_drawn_is_the_run_in_metres(sequence: PosedSequence, k: int) -> 
     assert min(off) < 0.01
 
 
-def test_batch_follows_the_slot_alone(sequence: PosedSequence) -> None:
+def test_batch_follows_the_slot_alone(sequence):
     signal = SelfSupervised([sequence], METADATA)
     both = signal.draw([Slot(1, 7, 0), Slot(1, 7, 1)])
     second = signal.draw([Slot(1, 7, 1)])
@@ -144,7 +141,7 @@ def test_batch_follows_the_slot_alone(sequence: PosedSequence) -> None:
     assert signal.describe([Slot(1, 7, 1)])[0].startswith("run/0.")
 
 
-def test_flipped_pairs_keep_their_geometry(sequence: PosedSequence) -> None:
+def test_flipped_pairs_keep_their_geometry(sequence):
     """Map points of view i move to the same colours in view j, mirrored or not."""
     from edgeslam_torch.losses.base import back_project, move, project
 
@@ -162,31 +159,31 @@ def test_flipped_pairs_keep_their_geometry(sequence: PosedSequence) -> None:
     assert max(errors) < 0.5
 
 
-def sample(image: Tensor, uv: Tensor) -> Tensor:
+def sample(image, uv):
     grid = (2 * uv / torch.tensor([127.0, 95.0]) - 1)[None, None]
     return torch.nn.functional.grid_sample(image, grid, align_corners=True)[0, :, 0].T
 
 
-def test_gradient_reaches_the_network(sequence: PosedSequence) -> None:
+def test_gradient_reaches_the_network(sequence):
     torch.manual_seed(0)
     network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
     signal = SelfSupervised([sequence], METADATA)
     batch = signal.draw([Slot(0, 0, 0)])
     losses = signal.losses(network.predict(batch["image"]), batch)
     assert set(losses) == {"photometric", "points", "cycle", "lshape", "smooth", "uncertainty"}
-    sum(v.sum() for v in losses.values()).backward()  # type: ignore[union-attr]
+    sum(v.sum() for v in losses.values()).backward()
     grads = [p.grad for p in network.parameters() if p.grad is not None]
     assert grads
     assert all(torch.isfinite(g).all() for g in grads)
 
 
-def test_scale_of_an_arbitrary_run_is_found(sequence: PosedSequence) -> None:
+def test_scale_of_an_arbitrary_run_is_found(sequence):
     views = [replace(v, z=v.z / 3.0) for v in sequence.views]
     found = fit_log_scale(views, [np.log(v.z) for v in sequence.views])
     assert np.exp(found) == pytest.approx(3.0, rel=1e-5)
 
 
-def test_straight_pieces_lie_on_straight_edges(rng: np.random.Generator) -> None:
+def test_straight_pieces_lie_on_straight_edges(rng):
     image = np.full((96, 128, 3), 30, np.uint8)
     cv2.rectangle(image, (30, 20), (90, 70), (200, 200, 200), -1)
     edges, arms = straight_edges(image, 100, 8, 8, rng)
@@ -201,7 +198,7 @@ def test_straight_pieces_lie_on_straight_edges(rng: np.random.Generator) -> None
     assert (blank_arms == -1).all()
 
 
-def test_junctions_of_two_views_are_paired_by_place_and_direction() -> None:
+def test_junctions_of_two_views_are_paired_by_place_and_direction():
     image = np.full((96, 128, 3), 30, np.uint8)
     cv2.rectangle(image, (30, 20), (90, 70), (200, 200, 200), -1)
     found = torch.from_numpy(junction_points(image, 8))
@@ -215,7 +212,7 @@ def test_junctions_of_two_views_are_paired_by_place_and_direction() -> None:
     assert seen_cosines(turned, found).isnan().all(), "arms the other way"
 
 
-def test_teacher_measures_what_the_network_does_not_know(sequence: PosedSequence, tmp_path: Path) -> None:
+def test_teacher_measures_what_the_network_does_not_know(sequence, tmp_path):
     torch.manual_seed(0)
     network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
     metres = 0.5
@@ -230,7 +227,7 @@ def test_teacher_measures_what_the_network_does_not_know(sequence: PosedSequence
 
 
 @pytest.mark.slow
-def test_finetune_command_runs_the_slam_on_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_finetune_command_runs_the_slam_on_a_flight(tmp_path, capsys):
     from edgeslam_torch.cli import main
     from edgeslam_torch.demo import DemoSettings, record
     from edgeslam_torch.models.checkpoint import load_checkpoint

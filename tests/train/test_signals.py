@@ -13,7 +13,7 @@ STILL = AugmentConfig(0, (1, 1), 0, 0, 0, 0, 0, 0, 0, 0, (1, 1), 0, 0, 0)
 
 
 @pytest.mark.parametrize("focal_px", [25.0, 50.0, 100.0])
-def test_depth_of_another_lens_is_that_of_the_training_camera(focal_px: float) -> None:
+def test_depth_of_another_lens_is_that_of_the_training_camera(focal_px):
     """Twice the focal length shows an object twice as large: to the training camera it is at half the distance."""
     K = np.array([[focal_px, 0, 31.5], [0, focal_px, 15.5], [0, 0, 1]])
     depth = np.linspace(1, 4, 64, dtype=np.float32)[None].repeat(32, 0)

@@ -18,12 +18,12 @@ from edgeslam_torch.writers.depth_picture import BAR_PX, LABELS_PX, colour, roun
         (1.999, 2.001, [2.001, 2, 1.999]),
     ],
 )
-def test_marks_are_round_and_within(nearest: float, farthest: float, expected: list[float]) -> None:
+def test_marks_are_round_and_within(nearest, farthest, expected):
     margin = 1e-9
     assert round_distances(1 / farthest - margin, 1 / nearest + margin) == pytest.approx(expected)
 
 
-def test_a_pixel_has_the_colour_that_the_bar_shows_for_its_depth() -> None:
+def test_a_pixel_has_the_colour_that_the_bar_shows_for_its_depth():
     inverse = np.linspace(0.2, 2.0, 321)  # 5 m to 0.5 m
     depth = np.tile((1 / inverse).astype(np.float32), (50, 1))
     picture = colour(depth)
@@ -35,7 +35,7 @@ def test_a_pixel_has_the_colour_that_the_bar_shows_for_its_depth() -> None:
         assert difference <= 12  # two steps of the colour map
 
 
-def test_unknown_depth_is_black_and_a_picture_of_nothing_says_so() -> None:
+def test_unknown_depth_is_black_and_a_picture_of_nothing_says_so():
     depth = np.full((40, 100), 2.0, np.float32)
     depth[:10], depth[10:20], depth[20:30] = np.nan, np.inf, 0.0
     assert (colour(depth)[:30] == 0).all()
@@ -47,5 +47,5 @@ def test_unknown_depth_is_black_and_a_picture_of_nothing_says_so() -> None:
 
 @pytest.mark.parametrize("metres", [0.05, 0.3, 2.0, 77.7, 200.0])
 @pytest.mark.parametrize("width", [1, 20, 640])
-def test_one_depth_everywhere_is_drawn(metres: float, width: int) -> None:
+def test_one_depth_everywhere_is_drawn(metres, width):
     assert colour(np.full((4, width), metres, np.float32)).shape == (4 + BAR_PX + LABELS_PX, width, 3)

@@ -10,7 +10,7 @@ from edgeslam_torch.types import Frame
 from edgeslam_torch.writers.keyframe_images import KeyframeImages, kept_images
 
 
-def _frame(index: int) -> Frame:
+def _frame(index):
     image = cv2.GaussianBlur(np.random.default_rng(index).integers(0, 256, (48, 64, 3), np.uint8), (0, 0), 3)
     return Frame(index, 100.0 + index, image)
 

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,7 +14,7 @@ import pytest
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.types import Observations, PointCloud
 from edgeslam_torch.writers.maps.colmap import write_colmap
 from edgeslam_torch.writers.maps.directions import edge_directions
@@ -26,19 +25,19 @@ CAMERA = PRESETS["tum_fr1"]
 POSES = np.stack([np.eye(4), se3.exp(np.array([0.3, -0.1, 0.05, 0.02, -0.1, 0.03]))])
 
 
-def cloud(p_w: np.ndarray) -> PointCloud:
+def cloud(p_w):
     count = len(p_w)
     colour = np.tile(np.array([10, 20, 30], np.uint8), (count, 1))
     return PointCloud(p_w.astype(np.float32), colour, np.full(count, 0.02, np.float32), np.full(count, 2, np.int32))
 
 
 @pytest.fixture
-def anchors(rng: np.random.Generator) -> PointCloud:
+def anchors(rng):
     return cloud(rng.uniform([-0.5, -0.4, 2.0], [0.5, 0.4, 4.0], (40, 3)))
 
 
 @pytest.fixture
-def seen(anchors: PointCloud) -> Observations:
+def seen(anchors):
     """All anchors in the first image, every other one in the second, where an ideal camera sees them."""
     pairs = [(0, i) for i in range(40)] + [(1, i) for i in range(0, 40, 2)]
     keyframe, anchor = np.array(pairs).T
@@ -61,9 +60,7 @@ print(json.dumps({"tracks": tracks, "worst_px": max(errors), "observations": r.c
 """
 
 
-def test_colmap_links_points_to_the_pixels_that_saw_them(
-    anchors: PointCloud, seen: Observations, tmp_path: Path
-) -> None:
+def test_colmap_links_points_to_the_pixels_that_saw_them(anchors, seen, tmp_path):
     if importlib.util.find_spec("pycolmap") is None:
         pytest.skip("pycolmap is not installed: the COLMAP model is not read by COLMAP")
     edges = cloud(np.array([[0.0, 0.0, 3.0], [0.1, 0.0, 3.0]]))
@@ -76,7 +73,7 @@ def test_colmap_links_points_to_the_pixels_that_saw_them(
     assert found["worst_px"] < 0.02, "pixels have three decimals, points six digits"
 
 
-def test_observations_come_back_as_they_were(seen: Observations, tmp_path: Path) -> None:
+def test_observations_come_back_as_they_were(seen, tmp_path):
     write_observations(tmp_path / "o.npz", seen)
     again = read_observations(tmp_path / "o.npz")
     for name in ("stamps_s", "keyframe", "anchor", "uv"):
@@ -84,7 +81,7 @@ def test_observations_come_back_as_they_were(seen: Observations, tmp_path: Path)
 
 
 @pytest.mark.parametrize("damage", ["missing", "text", "cut", "foreign", "short", "claim"])
-def test_damaged_observations_are_one_line(damage: str, seen: Observations, tmp_path: Path) -> None:
+def test_damaged_observations_are_one_line(damage, seen, tmp_path):
     path = tmp_path / "o.npz"
     write_observations(path, seen if damage != "short" else replace(seen, uv=seen.uv[:3]))
     if damage == "missing":
@@ -104,9 +101,7 @@ def test_damaged_observations_are_one_line(damage: str, seen: Observations, tmp_
         read_observations(path)
 
 
-def test_nerfstudio_sees_each_anchor_where_the_image_has_it(
-    anchors: PointCloud, seen: Observations, tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_nerfstudio_sees_each_anchor_where_the_image_has_it(anchors, seen, tmp_path, rng):
     images = []
     for name in ("a.png", "b.png"):
         images.append(tmp_path / name)
@@ -130,22 +125,22 @@ def test_nerfstudio_sees_each_anchor_where_the_image_has_it(
     assert (tmp_path / "n" / scene["ply_file_path"]).is_file()
 
 
-def test_nearest_of_two_points_of_a_pixel_is_its_depth() -> None:
+def test_nearest_of_two_points_of_a_pixel_is_its_depth():
     p_w = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 1.5], [0.0, 0.0, -1.0]])
     uv = np.tile([[CAMERA.cx, CAMERA.cy]], (3, 1))
     depth = sparse_depth(CAMERA, np.eye(4), p_w, uv)
     assert depth.max() == 1500 and np.count_nonzero(depth) == 1
 
 
-def test_mask_is_black_where_the_lens_showed_nothing() -> None:
-    pinhole: Camera = replace(CAMERA, distortion=(0.0,) * 5)
+def test_mask_is_black_where_the_lens_showed_nothing():
+    pinhole = replace(CAMERA, distortion=(0.0,) * 5)
     assert valid_pixels(pinhole).min() == 255
     pincushion = replace(CAMERA, distortion=(0.4, 0.0, 0.0, 0.0, 0.0))
     mask = valid_pixels(pincushion)
     assert mask[240, 320] == 255 and mask[0, 0] == 0
 
 
-def test_directions_follow_edges_and_are_zero_where_there_is_none(rng: np.random.Generator) -> None:
+def test_directions_follow_edges_and_are_zero_where_there_is_none(rng):
     along = np.array([2.0, -1.0, 0.5]) / np.sqrt(5.25)
     camera = np.array([[0.0, 0.0, -3.0]])
     line = np.linspace(0, 1, 200)[:, None] * along
@@ -158,7 +153,7 @@ def test_directions_follow_edges_and_are_zero_where_there_is_none(rng: np.random
     assert edge_directions(np.zeros((2, 3)), camera).tolist() == [[0.0] * 3] * 2
 
 
-def test_las_reader_gives_the_cloud_back(anchors: PointCloud, tmp_path: Path) -> None:
+def test_las_reader_gives_the_cloud_back(anchors, tmp_path):
     laspy = pytest.importorskip("laspy", reason="laspy is not installed")
     from edgeslam_torch.writers.maps.las import write_las
 
@@ -169,6 +164,6 @@ def test_las_reader_gives_the_cloud_back(anchors: PointCloud, tmp_path: Path) ->
     np.testing.assert_array_equal(found["sigma"], anchors.sigma_m)
 
 
-def test_nerfstudio_needs_the_images(tmp_path: Path, anchors: PointCloud, seen: Observations) -> None:
+def test_nerfstudio_needs_the_images(tmp_path, anchors, seen):
     with pytest.raises(SourceError, match=r"gone\.png: cannot be read"):
         write_nerfstudio(tmp_path, CAMERA, [tmp_path / "gone.png"] * 2, POSES, anchors, anchors, seen)

@@ -1,7 +1,6 @@
 """The ablation's bookkeeping: which runs are made, and what the table says."""
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -21,9 +20,9 @@ from edgeslam_torch.files.config_file import load_config
 
 
 @pytest.fixture
-def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[dict]:
+def runs(monkeypatch, tmp_path):
     """Cases without runs: every figure follows from the settings."""
-    made: list[dict] = []
+    made = []
 
     def run_tasks(tasks, runner, resume):
         for case, task in tasks.items():

@@ -2,9 +2,6 @@
 
 import argparse
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +15,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.metrics.run_score import evaluate_run
 
 
-def record(ate: list[float], cpu: list[float]) -> dict[str, Any]:
+def record(ate, cpu):
     runs = [
         {
             "sequence": "tum_fr1_xyz",
@@ -41,11 +38,11 @@ def record(ate: list[float], cpu: list[float]) -> dict[str, Any]:
     }
 
 
-def verdicts(a: dict[str, Any], b: dict[str, Any]) -> dict[str, str]:
+def verdicts(a, b):
     return {row["metric"]: row["verdict"] for row in compare(a, b) if not row["metric"].startswith("stage:")}
 
 
-def test_change_beyond_the_scatter_is_named_with_its_direction() -> None:
+def test_change_beyond_the_scatter_is_named_with_its_direction():
     a, b = record([0.010, 0.0101, 0.0102], [30, 31, 32]), record([0.013, 0.0131, 0.0132], [20, 21, 22])
     assert verdicts(a, b) == {"ate_sim3_m": "worse", "coverage": "same", "cpu_ms_per_frame": "better"}
     assert verdicts(b, a) == {"ate_sim3_m": "better", "coverage": "same", "cpu_ms_per_frame": "worse"}
@@ -53,12 +50,12 @@ def test_change_beyond_the_scatter_is_named_with_its_direction() -> None:
     assert "2 of 4 differences lie inside the noise; outside it: tum_fr1_xyz ATE Sim(3) [m] (worse)" in text
 
 
-def test_one_seed_is_judged_by_the_floors() -> None:
+def test_one_seed_is_judged_by_the_floors():
     found = verdicts(record([0.0100], [30.0]), record([0.0102], [32.0]))
     assert found["ate_sim3_m"] == "same" and found["cpu_ms_per_frame"] == "same"
 
 
-def test_table_lists_every_run_its_median_and_the_peers() -> None:
+def test_table_lists_every_run_its_median_and_the_peers():
     text = markdown_bench(record([0.0100, 0.0110, 0.0130], [30, 31, 32]))
     assert text.count("| edgeslam, seed") == 3
     assert "median of 3** | 0.0110" in text
@@ -67,27 +64,27 @@ def test_table_lists_every_run_its_median_and_the_peers() -> None:
     assert "tracking 5.00 ±0.75" in text
 
 
-def test_what_is_not_the_whole_sequence_is_said() -> None:
+def test_what_is_not_the_whole_sequence_is_said():
     text = markdown_bench(record([0.01], [30]) | {"max_frames": 80, "took_s": 90.0})
     assert "only the first 80 frames" in text and "1.5 minutes" in text
     assert "| DROID-SLAM, tum_fr1 (average of 9) [" in text
 
 
-def test_figures_are_plain_numbers(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_figures_are_plain_numbers(run_folder, tmp_path):
     truth = run_folder(tmp_path / "a")
     found = figures_of(evaluate_run(tmp_path / "a", truth))
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert found["ate_sim3_m"] is not None and found["cpu_ms_per_frame"] == 33.1
 
 
-def timed_record(rng: np.random.Generator, speed: float, scatter: float, factor: float = 1.0) -> dict[str, Any]:
+def timed_record(rng, speed, scatter, factor=1.0):
     """A benchmark of three sequences at this speed of the machine whose every time scatters by ``scatter``."""
 
-    def bout() -> dict[str, Any]:
+    def bout():
         work = {key: 50 / speed * noisy(0.01) for key in ("one_ms", "cpu_ms", "wall_ms")}
         return {"reference": work, "solver": {"all terms": 150 * factor / speed * noisy(scatter)}}
 
-    def noisy(s: float) -> float:
+    def noisy(s):
         return float(np.exp(s * rng.normal()))
 
     bouts, runs = [bout()], []
@@ -110,7 +107,7 @@ def timed_record(rng: np.random.Generator, speed: float, scatter: float, factor:
     return {"format": 2, "runs": runs, "machine": {"cpu": "some"}, **gather(bouts)}
 
 
-def test_times_of_one_program_agree_at_any_speed_of_the_machine(rng: np.random.Generator) -> None:
+def test_times_of_one_program_agree_at_any_speed_of_the_machine(rng):
     rows = [
         row
         for _ in range(60)
@@ -121,13 +118,13 @@ def test_times_of_one_program_agree_at_any_speed_of_the_machine(rng: np.random.G
     assert len(outside) <= 0.01 * len(rows), "a table of fifty times is to hold none by chance"
 
 
-def test_a_third_more_time_is_seen_at_any_speed_of_the_machine(rng: np.random.Generator) -> None:
+def test_a_third_more_time_is_seen_at_any_speed_of_the_machine(rng):
     for speed in (0.7, 1.0, 1.4):
         found = compare(timed_record(rng, 1.0, 0.02), timed_record(rng, speed, 0.02, factor=1.33))
         assert {row["verdict"] for row in found} == {"worse"}, speed
 
 
-def test_without_the_reference_a_slower_machine_is_a_slower_program(rng: np.random.Generator) -> None:
+def test_without_the_reference_a_slower_machine_is_a_slower_program(rng):
     a, b = timed_record(rng, 1.0, 0.01), timed_record(rng, 0.6, 0.01)
     assert {row["verdict"] for row in compare(a, b)} == {"same"}
     for found in (a, b):
@@ -135,7 +132,7 @@ def test_without_the_reference_a_slower_machine_is_a_slower_program(rng: np.rand
     assert all(row["verdict"] == "worse" for row in compare(a, b) if row["metric"] == "cpu_ms_per_frame")
 
 
-def test_other_conditions_and_a_busy_machine_are_named(rng: np.random.Generator) -> None:
+def test_other_conditions_and_a_busy_machine_are_named(rng):
     a, b = timed_record(rng, 1.0, 0.02), timed_record(rng, 0.8, 0.02)
     b["machine"], b["max_frames"] = {"cpu": "other"}, 40
     b["runs"][2]["disturbance"] = {"others": 0.4, "stolen": 0.03, "busy": True}
@@ -145,7 +142,7 @@ def test_other_conditions_and_a_busy_machine_are_named(rng: np.random.Generator)
     assert "its host took up to 3%" in text
 
 
-def test_a_part_that_cannot_be_measured_says_why() -> None:
+def test_a_part_that_cannot_be_measured_says_why():
     found = gather(
         [
             {"reference": {"one_ms": 1.0}, "solver": {"points": 2.0, "beside": "no gtsam"}, "depth": {"fp32": 3.0}},
@@ -160,7 +157,7 @@ def test_a_part_that_cannot_be_measured_says_why() -> None:
     assert found["depth"] == {"not measured": "x"}
 
 
-def test_what_others_use_is_told_from_what_we_use(tmp_path: Path) -> None:
+def test_what_others_use_is_told_from_what_we_use(tmp_path):
     stat = tmp_path / "stat"
     stat.write_text("cpu  100 0 50 900 10 0 5 7 0 0\ncpu0 1 0 1 1\ncpu1 1 0 1 1\nintr 5\n")
     found = read_cpu_times(stat)
@@ -172,7 +169,7 @@ def test_what_others_use_is_told_from_what_we_use(tmp_path: Path) -> None:
     assert not told.busy and disturbance(None, after) is None
 
 
-def test_only_recordings_at_camera_rate_are_benchmarked(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_only_recordings_at_camera_rate_are_benchmarked(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     poses = (tmp_path / "truth.txt").read_text()
     for name, step in (("fast", 1), ("slow", 3)):
@@ -188,7 +185,7 @@ def test_only_recordings_at_camera_rate_are_benchmarked(run_folder: Callable[...
 
 
 @pytest.mark.parametrize("text", [None, "not json", "[]", '{"format": 0, "runs": []}'])
-def test_other_files_are_no_records(text: str | None, tmp_path: Path) -> None:
+def test_other_files_are_no_records(text, tmp_path):
     path = tmp_path / "r.json"
     if text is not None:
         path.write_text(text)
@@ -196,13 +193,13 @@ def test_other_files_are_no_records(text: str | None, tmp_path: Path) -> None:
         read_record(path)
 
 
-def run_bench(*words: object) -> int:
+def run_bench(*words):
     parser = argparse.ArgumentParser()
     bench.add_arguments(parser)
     return bench.main(parser.parse_args([str(w) for w in words]))
 
 
-def test_compare_reads_two_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_compare_reads_two_results(tmp_path, capsys):
     for name, ate in (("a", 0.010), ("b", 0.020)):
         (tmp_path / f"{name}.json").write_text(json.dumps(record([ate, ate], [30, 30])))
     assert run_bench("--compare", tmp_path / "a.json", tmp_path / "b.json") == 0
@@ -214,9 +211,7 @@ def test_compare_reads_two_results(tmp_path: Path, capsys: pytest.CaptureFixture
 @pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.timeout(1200)
-def test_synthetic_flight_is_run_and_judged(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_synthetic_flight_is_run_and_judged(tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("EDGESLAM_DATA", raising=False)
     assert run_bench("--seeds", 1, "--max-frames", 40, "--no-micro", "--out", tmp_path / "bench") == 0
     text = capsys.readouterr().out

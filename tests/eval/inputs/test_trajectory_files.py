@@ -1,8 +1,6 @@
 """Trajectory files are read back as written, and refused with the likely mistake when they are none."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from edgeslam_torch.eval.inputs.trajectory_files import WRITERS, Trajectory, rea
 
 
 @pytest.mark.parametrize("name", sorted(WRITERS))
-def test_every_format_round_trips(name: str, loop: Trajectory, tmp_path: Path) -> None:
+def test_every_format_round_trips(name, loop, tmp_path):
     start = Trajectory(np.arange(len(loop)) / 30.0, loop.T_w_c, "loop")
     path = tmp_path / {"euroc": "data.csv", "7scenes": "seq"}.get(name, "poses.txt")
     WRITERS[name](start, path)
@@ -24,9 +22,7 @@ def test_every_format_round_trips(name: str, loop: Trajectory, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("name", ["kitti", "7scenes"])
-def test_formats_without_stamps_keep_those_of_another_clock_beside_them(
-    name: str, loop: Trajectory, tmp_path: Path
-) -> None:
+def test_formats_without_stamps_keep_those_of_another_clock_beside_them(name, loop, tmp_path):
     start = Trajectory(1.3e9 + np.sort(np.random.default_rng(0).uniform(0, 9, len(loop))), loop.T_w_c, "loop")
     path = tmp_path / {"7scenes": "seq"}.get(name, "poses.txt")
     WRITERS[name](start, path)
@@ -39,7 +35,7 @@ def test_formats_without_stamps_keep_those_of_another_clock_beside_them(
         read_trajectory(path)
 
 
-def tum(path: Path, rows: list[list[float]] | list[str]) -> Path:
+def tum(path, rows):
     path.write_text("\n".join(r if isinstance(r, str) else " ".join(map(str, r)) for r in rows) + "\n")
     return path
 
@@ -63,13 +59,13 @@ GOOD = ["0.0 0 0 0 0 0 0 1", "0.1 1 0 0 0 0 0 1", "0.2 2 0 0 0 0 0 1"]
         ([*GOOD, "0.3 one 0 0 0 0 0 1"], "line 4, column 2 is not a number"),
     ],
 )
-def test_what_is_no_trajectory_is_named(rows: list[str], words: str, tmp_path: Path) -> None:
+def test_what_is_no_trajectory_is_named(rows, words, tmp_path):
     with pytest.raises(EvaluationError, match=words) as caught:
         read_trajectory(tum(tmp_path / "t.txt", rows))
     assert "t.txt" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_missing_binary_and_empty_folders_are_named(tmp_path: Path) -> None:
+def test_missing_binary_and_empty_folders_are_named(tmp_path):
     (tmp_path / "b.txt").write_bytes(bytes(range(256)))
     with pytest.raises(EvaluationError, match="not a text file"):
         read_trajectory(tmp_path / "b.txt")
@@ -79,7 +75,7 @@ def test_missing_binary_and_empty_folders_are_named(tmp_path: Path) -> None:
         read_trajectory(tmp_path)
 
 
-def test_corrected_rows_are_reported(tmp_path: Path) -> None:
+def test_corrected_rows_are_reported(tmp_path):
     rows = [GOOD[2], GOOD[1], GOOD[1], GOOD[0], "0.3 inf 0 0 0 0 0 1"]
     found = read_trajectory(tum(tmp_path / "t.txt", rows))
     assert found.stamps_s.tolist() == [0.0, 0.1, 0.2]
@@ -87,18 +83,18 @@ def test_corrected_rows_are_reported(tmp_path: Path) -> None:
     assert "not finite" in notes and "out of order" in notes and "repeat a stamp" in notes
 
 
-def test_reversed_time_is_sorted_and_said(tmp_path: Path) -> None:
+def test_reversed_time_is_sorted_and_said(tmp_path):
     found = read_trajectory(tum(tmp_path / "t.txt", GOOD[::-1]))
     assert found.positions[:, 0].tolist() == [0.0, 1.0, 2.0]
     assert "backwards" in found.notes[0]
 
 
-def test_line_cut_off_at_the_end_is_left_out(tmp_path: Path) -> None:
+def test_line_cut_off_at_the_end_is_left_out(tmp_path):
     (tmp_path / "t.txt").write_text("\n".join([*GOOD, "0.3 1 2"]))  # killed while writing: no newline
     assert len(read_trajectory(tmp_path / "t.txt")) == 3
 
 
-def test_large_files_read_the_same_as_small_ones(tmp_path: Path) -> None:
+def test_large_files_read_the_same_as_small_ones(tmp_path):
     rows = "".join(f"{0.1 * k:.1f} {k} 0 0 0 0 0 1\n" for k in range(60_000))  # 1.3 MB: read by NumPy
     for name, text in (("spaces", rows), ("commas", rows.replace(" ", ",")), ("header", "stamp x y z\n" + rows)):
         (tmp_path / name).write_text(text)
@@ -109,7 +105,7 @@ def test_large_files_read_the_same_as_small_ones(tmp_path: Path) -> None:
         read_trajectory(tmp_path / "broken")
 
 
-def test_huge_file_is_not_read(tmp_path: Path) -> None:
+def test_huge_file_is_not_read(tmp_path):
     with (tmp_path / "flight.bag").open("wb") as file:
         file.truncate(3 << 30)  # sparse: takes no room
     with pytest.raises(EvaluationError, match="3221 MB, more than"):
@@ -120,7 +116,7 @@ _MOUNT = "T_BS:\n  cols: 4\n  rows: 4\n  data: [0, -1, 0, 0.5, 1, 0, 0, 0, 0, 0,
 """A camera half a metre ahead of the body, a quarter turn around its axis."""
 
 
-def euroc_folder(folder: Path, body: Trajectory, sensor: str) -> Path:
+def euroc_folder(folder, body, sensor):
     """True poses and a camera's file, as EuRoC publishes them."""
     (folder / "mav0" / "cam0").mkdir(parents=True)
     (folder / "mav0" / "cam0" / "sensor.yaml").write_text(f"%YAML:1.0\nsensor_type: camera\n{sensor}")
@@ -130,7 +126,7 @@ def euroc_folder(folder: Path, body: Trajectory, sensor: str) -> Path:
     return truth
 
 
-def test_euroc_truth_becomes_the_cameras(loop: Trajectory, tmp_path: Path) -> None:
+def test_euroc_truth_becomes_the_cameras(loop, tmp_path):
     truth = euroc_folder(tmp_path, loop, _MOUNT)
     for place in (tmp_path, tmp_path / "mav0", truth):
         found = read_trajectory(place)
@@ -139,7 +135,7 @@ def test_euroc_truth_becomes_the_cameras(loop: Trajectory, tmp_path: Path) -> No
     assert "cam0" in found.notes[-1], "it says so"
 
 
-def test_euroc_truth_without_a_mount_stays_the_bodys(loop: Trajectory, tmp_path: Path) -> None:
+def test_euroc_truth_without_a_mount_stays_the_bodys(loop, tmp_path):
     found = read_trajectory(euroc_folder(tmp_path, loop, "rate_hz: 20\n"))
     np.testing.assert_allclose(found.T_w_c, loop.T_w_c, atol=1e-8)
 
@@ -148,13 +144,13 @@ def test_euroc_truth_without_a_mount_stays_the_bodys(loop: Trajectory, tmp_path:
     "sensor",
     ["T_BS: 3\n", "T_BS: {data: [1, 2]}\n", _MOUNT.replace("-1", ".nan"), _MOUNT.replace("-1", "-2"), "T_BS: [\n"],
 )
-def test_euroc_mount_that_is_none_is_refused(sensor: str, loop: Trajectory, tmp_path: Path) -> None:
+def test_euroc_mount_that_is_none_is_refused(sensor, loop, tmp_path):
     truth = euroc_folder(tmp_path, loop, sensor)
     with pytest.raises(EvaluationError, match=r"sensor\.yaml: T_BS"):
         read_trajectory(truth)
 
 
-def named(header: str, order: str, loop: Trajectory, stamp: Callable[[float], str], metre: float = 1.0) -> str:
+def named(header, order, loop, stamp, metre=1.0):
     """A table of ``loop`` with commas: its columns in any order, ``.`` for one that nobody asked for."""
     q = Rotation.from_matrix(loop.T_w_c[:, :3, :3]).as_quat()
     lines = [header]
@@ -164,7 +160,7 @@ def named(header: str, order: str, loop: Trajectory, stamp: Callable[[float], st
     return "\n".join(lines) + "\n"
 
 
-def ns(t: float) -> str:
+def ns(t):
     return f"{round(t * 1e9)}"
 
 
@@ -192,9 +188,7 @@ def ns(t: float) -> str:
         ),
     ],
 )
-def test_columns_are_found_by_their_names(
-    header: str, order: str, stamp: Callable[[float], str], metre: float, begin: float, loop: Trajectory, tmp_path: Path
-) -> None:
+def test_columns_are_found_by_their_names(header, order, stamp, metre, begin, loop, tmp_path):
     loop = replace(loop, stamps_s=begin + loop.stamps_s)
     (tmp_path / "t.csv").write_text(named(header, order, loop, stamp, metre))
     found = read_trajectory(tmp_path / "t.csv")
@@ -202,7 +196,7 @@ def test_columns_are_found_by_their_names(
     np.testing.assert_allclose(found.T_w_c, loop.T_w_c, atol=1e-6)
 
 
-def test_seconds_and_nanoseconds_in_two_columns_are_added(tmp_path: Path) -> None:
+def test_seconds_and_nanoseconds_in_two_columns_are_added(tmp_path):
     (tmp_path / "t.csv").write_text(
         "header.stamp.sec,header.stamp.nanosec,x,y,z\n5,250000000,1,2,3\n5,750000000,2,2,3\n"
     )
@@ -210,7 +204,7 @@ def test_seconds_and_nanoseconds_in_two_columns_are_added(tmp_path: Path) -> Non
     assert found.stamps_s.tolist() == [5.25, 5.75] and not found.oriented
 
 
-def test_positions_alone_are_a_trajectory(loop: Trajectory, tmp_path: Path) -> None:
+def test_positions_alone_are_a_trajectory(loop, tmp_path):
     np.savetxt(tmp_path / "p.txt", np.c_[loop.stamps_s, loop.positions])
     found = read_trajectory(tmp_path / "p.txt")
     assert not found.oriented
@@ -218,20 +212,20 @@ def test_positions_alone_are_a_trajectory(loop: Trajectory, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("digits", [0, 1])
-def test_rounded_stamps_are_named_as_the_cause(digits: int, loop: Trajectory, tmp_path: Path) -> None:
+def test_rounded_stamps_are_named_as_the_cause(digits, loop, tmp_path):
     rows = [f"{t:.{digits}f} {x} {y} {z} 0 0 0 1" for t, (x, y, z) in zip(loop.stamps_s, loop.positions, strict=True)]
     with pytest.raises(EvaluationError, match="digits"):
         read_trajectory(tum(tmp_path / "t.txt", rows))
 
 
-def test_pose_of_a_marker_goes_through_its_own_mount(loop: Trajectory, tmp_path: Path) -> None:
+def test_pose_of_a_marker_goes_through_its_own_mount(loop, tmp_path):
     """EuRoC's vicon0: marker to body to camera."""
     truth = euroc_folder(tmp_path, loop, _MOUNT)
     (truth.parent / "sensor.yaml").write_text(_MOUNT)
     np.testing.assert_allclose(read_trajectory(truth).T_w_c, loop.T_w_c, atol=1e-8)
 
 
-def test_tum_vi_truth_is_found_and_becomes_the_cameras(loop: Trajectory, tmp_path: Path) -> None:
+def test_tum_vi_truth_is_found_and_becomes_the_cameras(loop, tmp_path):
     mocap = tmp_path / "mav0" / "mocap0" / "data.csv"
     mocap.parent.mkdir(parents=True)
     (tmp_path / "mav0" / "cam0").mkdir()
@@ -245,7 +239,7 @@ def test_tum_vi_truth_is_found_and_becomes_the_cameras(loop: Trajectory, tmp_pat
     np.testing.assert_allclose(read_trajectory(mocap).T_w_c, found.T_w_c, atol=1e-6)  # by its place alone
 
 
-def test_rows_of_kitti_without_times_take_those_of_as_many_poses(loop: Trajectory, tmp_path: Path) -> None:
+def test_rows_of_kitti_without_times_take_those_of_as_many_poses(loop, tmp_path):
     WRITERS["kitti"](loop, tmp_path / "poses.txt")
     (tmp_path / "times.txt").unlink()
     rows = read_trajectory(tmp_path / "poses.txt")

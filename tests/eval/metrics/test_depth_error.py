@@ -1,7 +1,5 @@
 """Depth errors, by hand and on FastDepth's own sample."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 
 
-def test_error_worked_out_by_hand() -> None:
+def test_error_worked_out_by_hand():
     truth = np.array([[1.0, 2.0], [4.0, 0.0]])
     found = score_depth(np.array([[1.2, 2.0], [2.0, 9.0]]), truth)
     assert found.pixels == 3
@@ -28,7 +26,7 @@ def test_error_worked_out_by_hand() -> None:
     assert (found.delta1, found.delta2, found.delta3) == pytest.approx((2 / 3, 2 / 3, 2 / 3))
 
 
-def test_median_scaling_removes_a_factor(rng: np.random.Generator) -> None:
+def test_median_scaling_removes_a_factor(rng):
     truth = rng.uniform(1.0, 5.0, (20, 30))
     found = score_depth(0.4 * truth, truth, median_scaled=True)
     assert found.scale == pytest.approx(2.5)
@@ -36,7 +34,7 @@ def test_median_scaling_removes_a_factor(rng: np.random.Generator) -> None:
     assert score_depth(0.4 * truth, truth).delta1 == 0.0
 
 
-def test_edges_are_judged_alone() -> None:
+def test_edges_are_judged_alone():
     image = np.zeros((60, 60), np.uint8)
     image[:, 30:] = 200
     truth = np.where(image > 0, 2.0, 1.0)
@@ -49,14 +47,14 @@ def test_edges_are_judged_alone() -> None:
 
 
 @pytest.mark.parametrize("what", ["shape", "nothing measured"])
-def test_maps_that_cannot_be_compared_are_refused(what: str) -> None:
+def test_maps_that_cannot_be_compared_are_refused(what):
     prediction = np.ones((4, 4))
     truth = np.ones((4, 5)) if what == "shape" else np.zeros((4, 4))
     with pytest.raises(EvaluationError):
         score_depth(prediction, truth)
 
 
-def test_folders_are_matched_by_name(tmp_path: Path) -> None:
+def test_folders_are_matched_by_name(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         for k in range(2):
@@ -66,7 +64,7 @@ def test_folders_are_matched_by_name(tmp_path: Path) -> None:
         compare_folders(tmp_path / "a", tmp_path)
 
 
-def test_numbers_win_over_pictures_of_the_same_name_and_images_give_the_edges(tmp_path: Path) -> None:
+def test_numbers_win_over_pictures_of_the_same_name_and_images_give_the_edges(tmp_path):
     """A folder of ``edgeslam depth``: metres, millimetres and a coloured picture of each image."""
     for name in ("ours", "truth", "images"):
         (tmp_path / name).mkdir()
@@ -83,7 +81,7 @@ def test_numbers_win_over_pictures_of_the_same_name_and_images_give_the_edges(tm
     assert compare_folders(tmp_path / "ours", tmp_path / "truth").edges_metric is None
 
 
-def test_recording_is_matched_by_its_images_and_stamps(tmp_path: Path) -> None:
+def test_recording_is_matched_by_its_images_and_stamps(tmp_path):
     data, ours = tmp_path / "data", tmp_path / "ours"
     for folder in (data / "rgb", data / "depth", ours):
         folder.mkdir(parents=True)
@@ -107,13 +105,13 @@ def test_recording_is_matched_by_its_images_and_stamps(tmp_path: Path) -> None:
         compare_with_recording(ours, ours)
 
 
-def test_mean_is_over_maps() -> None:
+def test_mean_is_over_maps():
     a, b = score_depth(np.full((2, 2), 1.2), np.ones((2, 2))), score_depth(np.full((9, 9), 1.1), np.ones((9, 9)))
     assert mean_score([a, b]).abs_rel == pytest.approx(0.15)
 
 
 @pytest.mark.data
-def test_fastdepth_sample_scores_as_computed_directly(data_dir: Path) -> None:
+def test_fastdepth_sample_scores_as_computed_directly(data_dir):
     folder = data_dir / "fastdepth_sample"
     truth, prediction = np.load(folder / "depth.npy"), np.load(folder / "pred.npy")
     rgb = (255 * np.load(folder / "rgb.npy")).astype(np.uint8)

@@ -1,9 +1,7 @@
 """Trajectory errors: worked by hand, against evo, and for common mistakes in input files."""
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +17,7 @@ from edgeslam_torch.eval.metrics.trajectory_error import score_trajectory
 from edgeslam_torch.geometry import se3
 
 
-def random_pair(rng: np.random.Generator, count: int = 18) -> tuple[Trajectory, Trajectory]:
+def random_pair(rng, count=18):
     """A wandering camera and an estimate of it: noisy, turned, shifted, scaled, some poses missing."""
     stamps = 1e9 + np.cumsum(rng.uniform(0.02, 0.05, count))
     R = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.05, (count, 3)), axis=0))
@@ -36,7 +34,7 @@ def random_pair(rng: np.random.Generator, count: int = 18) -> tuple[Trajectory, 
     return Trajectory(stamps, T, "truth"), Trajectory(stamps[keep] + jitter, E[keep], "estimate")
 
 
-def test_umeyama_recovers_what_was_applied(rng: np.random.Generator) -> None:
+def test_umeyama_recovers_what_was_applied(rng):
     p = rng.normal(size=(30, 3))
     R, t = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix(), np.array([1.0, 2.0, -3.0])
     found = umeyama(p, 2.5 * p @ R.T + t)
@@ -45,13 +43,13 @@ def test_umeyama_recovers_what_was_applied(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(found.t, t, atol=1e-12)
 
 
-def test_umeyama_never_mirrors(rng: np.random.Generator) -> None:
+def test_umeyama_never_mirrors(rng):
     p = rng.normal(size=(30, 3))
     found = umeyama(p, p * [1.0, 1.0, -1.0])
     assert np.linalg.det(found.R) == pytest.approx(1.0)
 
 
-def test_error_worked_out_by_hand() -> None:
+def test_error_worked_out_by_hand():
     T = np.tile(np.eye(4), (3, 1, 1))
     T[:, 0, 3] = [0.0, 1.0, 2.0]
     E = T.copy()
@@ -71,7 +69,7 @@ def test_error_worked_out_by_hand() -> None:
     assert turned.full_transform.rmse == pytest.approx(np.sqrt(4.0 + 0.06))
 
 
-def evo_figures(truth: Trajectory, estimate: Trajectory, kind: AlignmentKind) -> dict[str, float]:
+def evo_figures(truth, estimate, kind):
     """What evo finds for the same pair."""
     sync = pytest.importorskip("evo.core.sync", reason="evo is not installed: no outside oracle")
     from evo.core import metrics
@@ -81,7 +79,7 @@ def evo_figures(truth: Trajectory, estimate: Trajectory, kind: AlignmentKind) ->
     a, b = sync.associate_trajectories(a, b, max_diff=0.02)
     if kind is not AlignmentKind.NONE:
         b.align(a, correct_scale=kind is AlignmentKind.SIM3)
-    out: dict[str, float] = {"pairs": a.num_poses}
+    out = {"pairs": a.num_poses}
     relations = metrics.PoseRelation
     for name, relation in (
         ("translation", relations.translation_part),
@@ -103,28 +101,24 @@ def evo_figures(truth: Trajectory, estimate: Trajectory, kind: AlignmentKind) ->
     return out
 
 
-def our_figures(truth: Trajectory, estimate: Trajectory, kind: AlignmentKind) -> dict[str, float]:
+def our_figures(truth, estimate, kind):
     score = score_trajectory(truth, estimate, kind)
-    out: dict[str, float] = {"pairs": score.matched}
-    for name, stats in (
-        ("translation", score.ate_m),
-        ("rotation", score.rotation_deg),
-        ("full", score.full_transform),
-    ):
+    out = {"pairs": score.matched}
+    for name, stats in (("translation", score.ate_m), ("rotation", score.rotation_deg), ("full", score.full_transform)):
         out[name], out[name + " max"] = stats.rmse, stats.max
     for relative, unit in ((score.relative[0], "frames"), (score.relative[2], "m")):
         out[f"rpe {unit}"], out[f"rpe angle {unit}"] = relative.translation_m.rmse, relative.rotation_deg.rmse
     return out
 
 
-def assert_agrees(truth: Trajectory, estimate: Trajectory, kind: AlignmentKind) -> None:
+def assert_agrees(truth, estimate, kind):
     theirs, ours = evo_figures(truth, estimate, kind), our_figures(truth, estimate, kind)
     for name, value in theirs.items():
         assert ours[name] == pytest.approx(value, abs=1e-6, rel=1e-9), name
 
 
 @pytest.mark.parametrize("kind", list(AlignmentKind))
-def test_agrees_with_evo_on_random_trajectories(kind: AlignmentKind, rng: np.random.Generator) -> None:
+def test_agrees_with_evo_on_random_trajectories(kind, rng):
     for _ in range(67):  # three alignments: 201 trajectories
         assert_agrees(*random_pair(rng), kind)
 
@@ -144,7 +138,7 @@ REFERENCES = {  # rmse, mean, std, max, pairs: evo 1.38, Sim(3), max dt 0.02 s (
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", sorted(REFERENCES))
-def test_reference_trajectories_score_what_evo_prints(name: str, data_dir: Path) -> None:
+def test_reference_trajectories_score_what_evo_prints(name, data_dir):
     truth_name, rmse, mean, std, most, pairs = REFERENCES[name]
     truth = read_trajectory(data_dir / truth_name)
     estimate = read_trajectory(data_dir / "reference_trajectories" / name)
@@ -156,7 +150,7 @@ def test_reference_trajectories_score_what_evo_prints(name: str, data_dir: Path)
     assert_agrees(truth.take(near), estimate.take(slice(200, 500)), AlignmentKind.SIM3)  # evo is slow
 
 
-def test_each_pose_of_the_shorter_list_gets_its_nearest() -> None:
+def test_each_pose_of_the_shorter_list_gets_its_nearest():
     truth, estimate = np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.11, 0.29, 5.0])
     i, j = match(truth, estimate, 0.02)
     assert i.tolist() == [1, 3] and j.tolist() == [0, 1]
@@ -167,9 +161,7 @@ def test_each_pose_of_the_shorter_list_gets_its_nearest() -> None:
 @pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")])
 @pytest.mark.parametrize("begin", [0.0, 1.6e9])
 @pytest.mark.parametrize("whose", ["truth", "estimate"])
-def test_stamps_in_other_units_are_converted_and_said(
-    factor: float, unit: str, begin: float, whose: str, loop: Trajectory, rng: np.random.Generator
-) -> None:
+def test_stamps_in_other_units_are_converted_and_said(factor, unit, begin, whose, loop, rng):
     stamps = begin + np.arange(len(loop)) * 0.05
     files = {"truth": replace(loop, stamps_s=stamps), "estimate": replace(noisy(loop, rng), stamps_s=stamps + 0.003)}
     files[whose] = replace(files[whose], stamps_s=files[whose].stamps_s * factor, source="mine.txt")
@@ -182,7 +174,7 @@ def test_stamps_in_other_units_are_converted_and_said(
 
 @pytest.mark.parametrize("begin", [0.0, 1.3e9])
 @pytest.mark.parametrize("poses", [[30.0], [30.0, 30.03, 30.07]])
-def test_a_handful_of_poses_are_seconds_too(begin: float, poses: list[float]) -> None:
+def test_a_handful_of_poses_are_seconds_too(begin, poses):
     stamps = begin + np.arange(0.0, 60.0, 0.01)
     truth, few = (Trajectory(t, np.tile(np.eye(4), (len(t), 1, 1))) for t in (stamps, begin + np.array(poses)))
     truth, few = on_one_clock(truth, few)
@@ -194,24 +186,24 @@ def test_a_handful_of_poses_are_seconds_too(begin: float, poses: list[float]) ->
     ("shift", "words"),
     [(-1.5e9, "counts from 1970"), (300.0, "constant offset"), (4e6, "days apart"), (0.05, "--max-dt")],
 )
-def test_stamps_that_never_meet_are_explained(shift: float, words: str) -> None:
+def test_stamps_that_never_meet_are_explained(shift, words):
     truth = 1.5e9 + np.arange(0.0, 20.0, 0.1)
     with pytest.raises(EvaluationError, match=words):
         associate(truth, truth + shift)
 
 
-def findings(truth: Trajectory, estimate: Trajectory, kind: str = "sim3", **options: float) -> str:
+def findings(truth, estimate, kind="sim3", **options):
     score = score_trajectory(truth, estimate, kind, **options)
     return " | ".join(explain(truth, estimate, score))
 
 
-def noisy(loop: Trajectory, rng: np.random.Generator) -> Trajectory:
+def noisy(loop, rng):
     T = loop.T_w_c.copy()
     T[:, :3, 3] += rng.normal(0.0, 0.004, (len(T), 3))
     return replace(loop, T_w_c=T)
 
 
-def test_a_good_trajectory_gets_no_findings(loop: Trajectory, rng: np.random.Generator) -> None:
+def test_a_good_trajectory_gets_no_findings(loop, rng):
     assert findings(loop, noisy(loop, rng)) == ""
 
 
@@ -219,7 +211,7 @@ WORLD = se3.exp(np.array([4.0, -2.0, 1.0, 0.4, -0.9, 1.3]))
 """Another world frame: a run's begins where the camera was first."""
 
 
-def w_first(trajectory: Trajectory) -> Trajectory:
+def w_first(trajectory):
     """Its file, with the scalar part written first and read as if it came last."""
     q = Rotation.from_matrix(trajectory.T_w_c[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
     T = trajectory.T_w_c.copy()
@@ -227,13 +219,13 @@ def w_first(trajectory: Trajectory) -> Trajectory:
     return replace(trajectory, T_w_c=T)
 
 
-def inverted_rotations(trajectory: Trajectory) -> Trajectory:
+def inverted_rotations(trajectory):
     T = trajectory.T_w_c.copy()
     T[:, :3, :3] = np.swapaxes(T[:, :3, :3], 1, 2)
     return replace(trajectory, T_w_c=T)
 
 
-def in_centimetres(trajectory: Trajectory) -> Trajectory:
+def in_centimetres(trajectory):
     T = trajectory.T_w_c.copy()
     T[:, :3, 3] *= 100.0
     return replace(trajectory, T_w_c=T)
@@ -249,9 +241,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize("whose", ["the ground truth", "the estimate"])
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_found_in_the_file_that_has_it(
-    mistake: str, whose: str, loop: Trajectory, rng: np.random.Generator
-) -> None:
+def test_a_mistake_is_found_in_the_file_that_has_it(mistake, whose, loop, rng):
     files = {"the ground truth": loop, "the estimate": replace(noisy(loop, rng), T_w_c=WORLD @ noisy(loop, rng).T_w_c)}
     files[whose] = MISTAKES[mistake](files[whose])
     said = findings(*files.values())
@@ -259,7 +249,7 @@ def test_a_mistake_is_found_in_the_file_that_has_it(
 
 
 @pytest.mark.parametrize("mistake", ["world-to-camera", "look inverted"])
-def test_nobody_is_blamed_where_both_could_be_wrong(mistake: str, loop: Trajectory, rng: np.random.Generator) -> None:
+def test_nobody_is_blamed_where_both_could_be_wrong(mistake, loop, rng):
     """In one world frame the inverse of either explains it."""
     said = findings(MISTAKES[mistake](loop), noisy(loop, rng))
     assert mistake in said and "undecidable" in said
@@ -267,9 +257,7 @@ def test_nobody_is_blamed_where_both_could_be_wrong(mistake: str, loop: Trajecto
 
 @pytest.mark.parametrize("alone", [True, False], ids=["positions", "0 0 0 1"])
 @pytest.mark.parametrize("whose", ["the ground truth", "the estimate"])
-def test_figures_that_need_orientations_are_left_out_without(
-    whose: str, alone: bool, loop: Trajectory, rng: np.random.Generator
-) -> None:
+def test_figures_that_need_orientations_are_left_out_without(whose, alone, loop, rng):
     files = {"the ground truth": loop, "the estimate": noisy(loop, rng)}
     T = files[whose].T_w_c.copy()
     T[:, :3, :3] = np.eye(3)
@@ -282,7 +270,7 @@ def test_figures_that_need_orientations_are_left_out_without(
     assert said.startswith(whose) and "left out" in said
 
 
-def test_a_camera_that_only_shifts_has_orientations(loop: Trajectory, rng: np.random.Generator) -> None:
+def test_a_camera_that_only_shifts_has_orientations(loop, rng):
     T = loop.T_w_c.copy()
     T[:, :3, :3] = np.eye(3)
     truth, estimate = replace(loop, T_w_c=T), noisy(loop, rng)
@@ -292,38 +280,38 @@ def test_a_camera_that_only_shifts_has_orientations(loop: Trajectory, rng: np.ra
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 2e-4])
-def test_a_truth_that_never_moves_is_refused(noise_m: float, loop: Trajectory, rng: np.random.Generator) -> None:
+def test_a_truth_that_never_moves_is_refused(noise_m, loop, rng):
     T = loop.T_w_c.copy()
     T[:, :3, 3] = [3.0, 2.0, 1.0] + noise_m * rng.normal(size=(len(T), 3))
     with pytest.raises(EvaluationError, match=r"gt.txt: .*never moves"):
         score_trajectory(replace(loop, T_w_c=T, source="gt.txt"), loop)
 
 
-def test_a_score_of_hardly_any_pairs_is_refused(loop: Trajectory) -> None:
+def test_a_score_of_hardly_any_pairs_is_refused(loop):
     """Stamps that meet by accident: 4 of 787 poses give an ATE of millimetres."""
     stamps = loop.stamps_s[0] + 0.0251 + 1.037 * (loop.stamps_s - loop.stamps_s[0])
     with pytest.raises(EvaluationError, match=r"poses have a match.*--max-dt"):
         score_trajectory(loop, replace(loop, stamps_s=stamps), max_dt_s=0.001)
 
 
-def test_late_stamps_are_measured(loop: Trajectory, rng: np.random.Generator) -> None:
+def test_late_stamps_are_measured(loop, rng):
     estimate = noisy(loop, rng)
     text = findings(loop, replace(estimate, stamps_s=estimate.stamps_s + 1.37))
     found = re.search(r"--offset (-[\d.]+)", text)
     assert found is not None and float(found.group(1)) == pytest.approx(-1.37, abs=0.025)  # half a frame
 
 
-def at(trajectory: Trajectory, positions: np.ndarray) -> Trajectory:
+def at(trajectory, positions):
     T = trajectory.T_w_c.copy()
     T[:, :3, 3] = positions
     return replace(trajectory, T_w_c=T)
 
 
-def walked(trajectory: Trajectory) -> np.ndarray:
+def walked(trajectory):
     return np.cumsum(np.random.default_rng(7).normal(0, 0.05, (len(trajectory), 3)), axis=0)
 
 
-def waves(t: np.ndarray) -> np.ndarray:
+def waves(t):
     return np.stack([np.sin(1.9 * t), np.cos(2.7 * t), 0.3 * np.sin(3.1 * t)], axis=1)
 
 
@@ -341,16 +329,12 @@ def waves(t: np.ndarray) -> np.ndarray:
         (lambda t: at(t, t.positions + walked(t)), "the run drifted or broke", "another sequence"),
     ],
 )
-def test_a_mistake_is_recognised_for_what_it_is(
-    change: Callable[[Trajectory], Trajectory], said: str, unsaid: str, loop: Trajectory, rng: np.random.Generator
-) -> None:
+def test_a_mistake_is_recognised_for_what_it_is(change, said, unsaid, loop, rng):
     text = findings(loop, change(noisy(loop, rng)))
     assert said in text and unsaid not in text
 
 
-def test_orientations_that_hardly_turn_are_judged_by_their_angle_to_the_truth(
-    loop: Trajectory, rng: np.random.Generator, tmp_path: Path
-) -> None:
+def test_orientations_that_hardly_turn_are_judged_by_their_angle_to_the_truth(loop, rng, tmp_path):
     """A recording like fr1_xyz looks one way: a wrong order of the quaternion spreads little, but is far off."""
     estimate = noisy(loop, rng).take(slice(0, 20))
     swapped = np.swapaxes(estimate.T_w_c[:, :3, :3], 1, 2)
@@ -366,9 +350,7 @@ def test_orientations_that_hardly_turn_are_judged_by_their_angle_to_the_truth(
 
 
 @pytest.mark.parametrize("factor", [1.0, 1e3, 1e9], ids=["s", "ms", "ns"])
-def test_clocks_that_never_meet_are_brought_together_by_shape(
-    factor: float, loop: Trajectory, rng: np.random.Generator
-) -> None:
+def test_clocks_that_never_meet_are_brought_together_by_shape(factor, loop, rng):
     truth = replace(loop, stamps_s=loop.stamps_s + 1.5e9, source="truth.txt")
     estimate = noisy(loop, rng).take(slice(40, 160))
     estimate = replace(estimate, stamps_s=factor * (estimate.stamps_s - estimate.stamps_s[0]), source="mine.txt")
@@ -380,20 +362,20 @@ def test_clocks_that_never_meet_are_brought_together_by_shape(
     assert fitted.ate_m.rmse < 0.03
 
 
-def test_no_offset_is_offered_for_another_shape(loop: Trajectory) -> None:
+def test_no_offset_is_offered_for_another_shape(loop):
     with pytest.raises(EvaluationError) as caught:
         score_trajectory(loop, replace(at(loop, walked(loop)), stamps_s=loop.stamps_s + 300.0))
     assert "fit best" not in str(caught.value)
 
 
-def test_monocular_run_judged_without_scale_is_warned_about(loop: Trajectory, rng: np.random.Generator) -> None:
+def test_monocular_run_judged_without_scale_is_warned_about(loop, rng):
     T = noisy(loop, rng).T_w_c
     T[:, :3, 3] *= 0.4
     assert "without scale" in findings(loop, replace(loop, T_w_c=T), "se3")
     assert "without scale" not in findings(loop, replace(loop, T_w_c=T), "sim3")
 
 
-def test_one_pose_and_a_standing_camera_are_refused(loop: Trajectory) -> None:
+def test_one_pose_and_a_standing_camera_are_refused(loop):
     with pytest.raises(EvaluationError, match="at least 2"):
         score_trajectory(loop, loop.take(slice(10, 11)))
     still = replace(loop, T_w_c=np.tile(np.eye(4), (len(loop), 1, 1)))
@@ -401,7 +383,7 @@ def test_one_pose_and_a_standing_camera_are_refused(loop: Trajectory) -> None:
         score_trajectory(loop, still)
 
 
-def test_motion_along_a_line_is_pointed_out() -> None:
+def test_motion_along_a_line_is_pointed_out():
     T = np.tile(np.eye(4), (50, 1, 1))
     T[:, 0, 3] = np.linspace(0, 3, 50)
     line = Trajectory(np.arange(50) / 10.0, T)

@@ -3,9 +3,7 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,15 +18,15 @@ from edgeslam_torch.eval.report.comparison import write_comparison
 class Cells(HTMLParser):
     """Rows of all tables, and all text."""
 
-    def __init__(self, page: Path) -> None:
+    def __init__(self, page):
         super().__init__()
-        self.rows: list[list[str]] = []
+        self.rows = []
         self.text = ""
-        self.tags: list[str] = []
+        self.tags = []
         self._cell = False
         self.feed(page.read_text(encoding="utf-8"))
 
-    def handle_starttag(self, tag: str, attrs: object) -> None:
+    def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
         if tag == "tr":
             self.rows.append([])
@@ -36,16 +34,16 @@ class Cells(HTMLParser):
         if self._cell:
             self.rows[-1].append("")
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         self._cell = False
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         self.text += data
         if self._cell:
             self.rows[-1][-1] += data
 
 
-def _changed(folder: Path, turn: float = 0.7, size: float = 2.0, **summary: object) -> None:
+def _changed(folder, turn=0.7, size=2.0, **summary):
     """Another world (turned, moved, ``size`` times as large), and other values in the summary."""
     run = read_trajectory(folder / "trajectory.txt")
     R = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
@@ -58,7 +56,7 @@ def _changed(folder: Path, turn: float = 0.7, size: float = 2.0, **summary: obje
 
 
 @pytest.fixture
-def two(tmp_path: Path, run_folder: Callable[..., Path]) -> tuple[Path, Path]:
+def two(tmp_path, run_folder):
     run_folder(tmp_path / "a", points=500)
     shutil.copytree(tmp_path / "a", tmp_path / "b")
     _changed(tmp_path / "b", fps=20.0, source=str(tmp_path / "secret" / "place"))
@@ -67,7 +65,7 @@ def two(tmp_path: Path, run_folder: Callable[..., Path]) -> tuple[Path, Path]:
     return tmp_path / "a", tmp_path / "b"
 
 
-def test_figures_and_their_difference(two: tuple[Path, Path], tmp_path: Path) -> None:
+def test_figures_and_their_difference(two, tmp_path):
     rows = {row[0]: row[1:] for row in Cells(write_comparison(*two, tmp_path / "c.html")).rows}
     assert rows["frames per second"] == ["24.5", "20.0", "-4.5"]
     a, b = (float(text.split()[0]) for text in rows["length of the path"][:2])
@@ -77,7 +75,7 @@ def test_figures_and_their_difference(two: tuple[Path, Path], tmp_path: Path) ->
     assert "seed" not in rows
 
 
-def test_one_path_is_aligned_to_the_other(two: tuple[Path, Path], tmp_path: Path) -> None:
+def test_one_path_is_aligned_to_the_other(two, tmp_path):
     text = Cells(write_comparison(*two, tmp_path / "c.html")).text
     found = re.search(
         r"B is aligned to A by (\d+) common frames .* scaled by ([\d.]+)\); .* distance is (\S+) m RMS", text
@@ -86,27 +84,25 @@ def test_one_path_is_aligned_to_the_other(two: tuple[Path, Path], tmp_path: Path
     assert found[1] == "200" and float(found[2]) == pytest.approx(0.5, abs=1e-3) and float(found[3]) < 1e-6
 
 
-def test_runs_without_common_frames_are_drawn_apart(two: tuple[Path, Path], tmp_path: Path) -> None:
+def test_runs_without_common_frames_are_drawn_apart(two, tmp_path):
     run = read_trajectory(two[1] / "trajectory.txt")
     write_tum(Trajectory(run.stamps_s + 1e6, run.T_w_c, "b"), two[1] / "trajectory.txt")
     assert "no frames in common" in Cells(write_comparison(*two, tmp_path / "c.html")).text
 
 
-def test_page_may_be_passed_on(two: tuple[Path, Path], tmp_path: Path) -> None:
+def test_page_may_be_passed_on(two, tmp_path):
     page = write_comparison(*two, tmp_path / "c.html").read_text()
     assert str(tmp_path) not in page and "secret" not in page
     assert not re.findall(r'(?:src|href)="(?!data:)', page) and "<script" not in page and "http" not in page
 
 
-def test_hostile_names_stay_text(two: tuple[Path, Path], tmp_path: Path) -> None:
+def test_hostile_names_stay_text(two, tmp_path):
     bad = two[1].rename(tmp_path / "<script>alert(1)<&script>")
     parsed = Cells(write_comparison(two[0], bad, tmp_path / "c.html"))
     assert "script" not in parsed.tags and "<script>alert(1)" in parsed.text
 
 
-def test_command_writes_reports_and_comparison(
-    two: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_reports_and_comparison(two, tmp_path, capsys):
     assert cli.main(["report", str(two[0]), str(two[1]), "--no-map-score"]) == 0
     assert [line.split()[0].rpartition("/")[2] for line in capsys.readouterr().out.splitlines()] == [
         "report.html",
@@ -121,7 +117,7 @@ def test_command_writes_reports_and_comparison(
         assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-def test_drawing_keeps_shape_and_direction() -> None:
+def test_drawing_keeps_shape_and_direction():
     drawn = line_drawings.view([np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0]])], ["red"], "m")
     points = re.search(r'points="([^"]+)"', drawn)
     assert points is not None
@@ -135,7 +131,7 @@ def test_drawing_keeps_shape_and_direction() -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(PROGRAM is None, reason="no chromium here")
-def test_page_in_a_browser(two: tuple[Path, Path], tmp_path: Path) -> None:
+def test_page_in_a_browser(two, tmp_path):
     page = write_comparison(*two, tmp_path / "c.html")
     with Browser(tmp_path / "profile") as browser:
         browser.open(page)

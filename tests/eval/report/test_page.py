@@ -3,10 +3,7 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
 from html.parser import HTMLParser
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -36,38 +33,38 @@ NAMES = (
 class Page(HTMLParser):
     """Title, number of elements of each kind and texts of scripts by id, as a browser's parser splits them."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         super().__init__()
-        self.text: dict[str, str] = {}
-        self.tags: list[str] = []
+        self.text = {}
+        self.tags = []
         self._in = ""
         self.feed(path.read_text(encoding="utf-8"))
-        self.data: dict[str, Any] = json.loads(self.text["data"])
+        self.data = json.loads(self.text["data"])
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
         self._in = dict(attrs).get("id") or tag
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         self._in = ""
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         self.text[self._in] = self.text.get(self._in, "") + data
 
 
-def with_summary(folder: Path, **changes: Any) -> Path:
+def with_summary(folder, **changes):
     file = folder / "summary.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
     return folder
 
 
 @pytest.fixture
-def run(run_folder: Callable[..., Path], tmp_path: Path) -> Path:
+def run(run_folder, tmp_path):
     run_folder(tmp_path / "run", points=100)
     return tmp_path / "run"
 
 
-def test_no_name_of_a_recording_breaks_the_page(run: Path) -> None:
+def test_no_name_of_a_recording_breaks_the_page(run):
     plain = Page(write_report(with_summary(run, source={"name": "plain"})))
     for name in NAMES:
         page = Page(write_report(with_summary(run, source={"name": name, "path": f"/nowhere/{name}"})))
@@ -79,7 +76,7 @@ def test_no_name_of_a_recording_breaks_the_page(run: Path) -> None:
         assert page.text["script"] == plain.text["script"]
 
 
-def test_no_reason_or_setting_breaks_the_page(run: Path) -> None:
+def test_no_reason_or_setting_breaks_the_page(run):
     plain = Page(write_report(run))
     for name in NAMES[:5]:
         (run / "config.toml").write_text(name)
@@ -90,20 +87,20 @@ def test_no_reason_or_setting_breaks_the_page(run: Path) -> None:
         assert page.data["events"][0][4] == name
 
 
-def test_a_large_map_is_shown_by_a_part_of_its_points(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_map_is_shown_by_a_part_of_its_points(run, monkeypatch):
     whole = len(Page(write_report(run)).text["edges-data"])
     monkeypatch.setattr("edgeslam_torch.eval.report.page.MAX_POINTS", 40)  # of 100
     assert len(Page(write_report(run)).text["edges-data"]) == pytest.approx(0.4 * whole, rel=0.02)
 
 
-def test_pieces_are_named_with_their_seconds(run: Path) -> None:
+def test_pieces_are_named_with_their_seconds(run):
     spans = ((0.0, 8.133333), (8.166667, 11.466667))
     pieces = [{"number": k, "supported": 5, "first_s": a, "last_s": b} for k, (a, b) in enumerate(spans)]
     story = Page(write_report(with_summary(run, pieces=pieces))).data["story"]
     assert "piece 0 from 0.0 to 8.1 s, piece 1 from 8.2 to 11.5 s" in story
 
 
-def test_joins_and_loops_are_told_with_their_evidence(run: Path) -> None:
+def test_joins_and_loops_are_told_with_their_evidence(run):
     joins, loops = ["piece 1 joined piece 0: 2 keyframes agree"], [f"loop {k} closed" for k in range(7)]
     story = Page(write_report(with_summary(run, joins=joins, loops=loops))).data["story"]
     assert "Places were seen again: piece 1 joined piece 0: 2 keyframes agree; loop 0 closed; " in story
@@ -111,11 +108,11 @@ def test_joins_and_loops_are_told_with_their_evidence(run: Path) -> None:
 
 
 @pytest.mark.parametrize("said", [None, "loop", 3, {}, [None, 3, ""]])
-def test_a_summary_without_joins_tells_of_none(run: Path, said: object) -> None:
+def test_a_summary_without_joins_tells_of_none(run, said):
     assert "seen again" not in Page(write_report(with_summary(run, joins=said, loops=said))).data["story"]
 
 
-def test_a_run_that_never_tracked_was_not_never_lost(run: Path) -> None:
+def test_a_run_that_never_tracked_was_not_never_lost(run):
     lines = (run / "status.csv").read_text().splitlines()
     at = lines[0].split(",").index("status")
     rows = [line.split(",") for line in lines[1:]]
@@ -126,14 +123,14 @@ def test_a_run_that_never_tracked_was_not_never_lost(run: Path) -> None:
     assert "lost" not in story
 
 
-def test_warnings_of_the_run_stand_under_its_story(run: Path) -> None:
+def test_warnings_of_the_run_stand_under_its_story(run):
     said = ["telemetry's velocities are not used", "the video stood still </script>"]
     file = write_report(with_summary(run, warnings=said))
     assert Page(file).data["warnings"] == said
     assert '<ul id="warnings"' in file.read_text(encoding="utf-8")
 
 
-def test_page_tells_nothing_about_the_disk(run: Path) -> None:
+def test_page_tells_nothing_about_the_disk(run):
     secret = "/home/Jane Doe/projects"
     with_summary(
         run,
@@ -163,11 +160,11 @@ def test_page_tells_nothing_about_the_disk(run: Path) -> None:
         ("tello://192.168.10.1/x", "tello://192.168.10.1/x"),
     ],
 )
-def test_paths_that_leave_the_run_keep_their_last_name_only(text: str, shown: str) -> None:
+def test_paths_that_leave_the_run_keep_their_last_name_only(text, shown):
     assert without_folders(text) == shown
 
 
-def test_page_counts_the_frames_that_the_terminal_counts(run: Path) -> None:
+def test_page_counts_the_frames_that_the_terminal_counts(run):
     page = Page(write_report(with_summary(run, offered=400, left_out=150, dropped_frames=50), judge_map=False))
     assert "400 frames," in page.data["story"]
     assert "150 of them were left out" in page.data["story"]
@@ -175,7 +172,7 @@ def test_page_counts_the_frames_that_the_terminal_counts(run: Path) -> None:
     assert "49.2\u00a0% of the frames were tracked" in page.data["story"]  # 197 of 400
 
 
-def test_a_loss_that_was_made_good_is_not_told_as_a_contradiction(run: Path) -> None:
+def test_a_loss_that_was_made_good_is_not_told_as_a_contradiction(run):
     table = (run / "status.csv").read_text()
     (run / "status.csv").write_text(re.sub("predicted|lost", "tracked", table))
     frames = len(table.splitlines()) - 1
@@ -187,19 +184,19 @@ def test_a_loss_that_was_made_good_is_not_told_as_a_contradiction(run: Path) -> 
 
 @pytest.mark.parametrize("value", [None, "text", [1], {"value": []}, -1, 10**400, True])
 @pytest.mark.parametrize("keys", ["offered frames peak_rss_mb source pieces", "left_out fps scale lost_events"])
-def test_summary_of_wrong_types_is_a_page_all_the_same(run: Path, keys: str, value: Any) -> None:
+def test_summary_of_wrong_types_is_a_page_all_the_same(run, keys, value):
     page = Page(write_report(with_summary(run, **dict.fromkeys(keys.split(), value)), judge_map=False))
     assert page.data["title"]
 
 
 @pytest.mark.parametrize("content", [b"stamp,status\n1,\xff\n", b'stamp,status\n1,"' + b"x" * 200_000])
-def test_status_that_is_no_table_is_refused_in_one_line(run: Path, content: bytes) -> None:
+def test_status_that_is_no_table_is_refused_in_one_line(run, content):
     (run / "status.csv").write_bytes(content)
     with pytest.raises(EvaluationError, match="status.csv: not a table of text"):
         open_run(run)
 
 
-def test_source_beside_the_run_is_found_by_its_relative_name(run: Path) -> None:
+def test_source_beside_the_run_is_found_by_its_relative_name(run):
     recording = run.parent / "recording"
     recording.mkdir()
     assert open_run(with_summary(run, source={"path": "../recording"})).source == run / "../recording"
@@ -209,7 +206,7 @@ def test_source_beside_the_run_is_found_by_its_relative_name(run: Path) -> None:
 
 
 @pytest.mark.parametrize("telemetry", [False, True])
-def test_keyframes_are_drawn_from_a_recording_with_and_without_telemetry(run: Path, telemetry: bool) -> None:
+def test_keyframes_are_drawn_from_a_recording_with_and_without_telemetry(run, telemetry):
     recording = run.parent / "recording"
     (recording / "rgb").mkdir(parents=True)
     stamps_s = open_run(run).trajectory.stamps_s[:60:10]

@@ -1,7 +1,6 @@
 """The report in a real headless browser: no error, something drawn, every control works, no network."""
 
 import json
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -33,20 +32,20 @@ REST = """new Promise(done => {
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory, run_folder: Callable[..., Path]) -> Path:
+def page(tmp_path_factory, run_folder):
     folder = tmp_path_factory.mktemp("report") / "run"
     truth = run_folder(folder, points=20_000)
     return write_report(folder, truth)
 
 
 @pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
+def browser(tmp_path):
     with Browser(tmp_path / "profile") as started:
         yield started
 
 
 @pytest.mark.slow
-def test_every_control_of_the_page_works(page: Path, browser: Browser) -> None:
+def test_every_control_of_the_page_works(page, browser):
     browser.open(page)
     found = browser.run(PROBE.read_text(encoding="utf-8"))
     assert found["ready"] == "yes"
@@ -82,7 +81,7 @@ def test_every_control_of_the_page_works(page: Path, browser: Browser) -> None:
 
 
 @pytest.mark.slow
-def test_page_fits_a_phone(page: Path, browser: Browser) -> None:
+def test_page_fits_a_phone(page, browser):
     browser.open(page, width=360, height=780, ratio=3.0, mobile=True)
     found = browser.run(PROBE.read_text(encoding="utf-8"))
     assert browser.errors == []
@@ -90,7 +89,7 @@ def test_page_fits_a_phone(page: Path, browser: Browser) -> None:
 
 
 @pytest.fixture(scope="module")
-def worst_page(tmp_path_factory: pytest.TempPathFactory, run_folder: Callable[..., Path]) -> Path:
+def worst_page(tmp_path_factory, run_folder):
     """Every text as long as it can be and without a space, a recording of hours that ends at a tick of the charts."""
     folder, long = tmp_path_factory.mktemp("worst") / "run", "unbroken_" * 30
     truth = run_folder(folder, points=500, rate_hz=199 / 12000)
@@ -105,7 +104,7 @@ def worst_page(tmp_path_factory: pytest.TempPathFactory, run_folder: Callable[..
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [320, 390, 1280])
-def test_no_text_of_a_run_makes_the_page_scroll_sideways(worst_page: Path, browser: Browser, width: int) -> None:
+def test_no_text_of_a_run_makes_the_page_scroll_sideways(worst_page, browser, width):
     browser.open(worst_page, width=width, height=844, mobile=width < 700)
     browser.run("document.querySelectorAll('details').forEach(d => d.open = true)")
     browser.run("[0.01, 0.5, 0.99].forEach(t => moveCursor(t * DATA.time[1], byId('inliers')))")
@@ -115,7 +114,7 @@ def test_no_text_of_a_run_makes_the_page_scroll_sideways(worst_page: Path, brows
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_largest_map_is_turned_in_short_frames(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+def test_largest_map_is_turned_in_short_frames(run_folder, tmp_path):
     """Prints what is asked for: milliseconds a frame with 200 000 points, drawn by the processor alone."""
     page = write_report(tmp_path / "run", run_folder(tmp_path / "run", points=200_000))
     assert page.stat().st_size < 15e6

@@ -1,7 +1,5 @@
 """ONNX: the exporter's file and the graph the SLAM builds for itself compute what torch computes."""
 
-from pathlib import Path
-
 import numpy as np
 import onnx
 import onnxruntime
@@ -10,7 +8,7 @@ import torch
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
-from edgeslam_torch.models.fastdepth import FastDepth, Variant
+from edgeslam_torch.models.fastdepth import Variant
 from edgeslam_torch.models.onnx.export import ExportOptions, export_onnx, set_opset
 from edgeslam_torch.models.onnx.file import read_onnx
 from edgeslam_torch.models.onnx.fold import deployed, fold_batch_norm
@@ -19,26 +17,26 @@ from edgeslam_torch.models.onnx.quantize import double_by_gather
 from edgeslam_torch.models.record import Metadata
 
 
-def random_network(metadata: Metadata) -> FastDepth:
+def random_network(metadata):
     """Fresh weights with batch norms that do something."""
     torch.manual_seed(1)
     network = build_network(metadata).eval()
     for module in network.modules():
         if isinstance(module, torch.nn.BatchNorm2d):
-            torch.nn.init.uniform_(module.running_mean, -0.5, 0.5)  # type: ignore[arg-type]
-            torch.nn.init.uniform_(module.running_var, 0.5, 2.0)  # type: ignore[arg-type]
+            torch.nn.init.uniform_(module.running_mean, -0.5, 0.5)
+            torch.nn.init.uniform_(module.running_var, 0.5, 2.0)
     return network
 
 
 METADATA = Metadata(variant=Variant.PRUNED.value, sigma_scale=1.5, sigma_floor=0.05)
 
 
-def run(model: bytes | str, image: np.ndarray) -> list[np.ndarray]:
+def run(model, image):
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     return session.run(["log_depth", "sigma_log"], {"image": image})
 
 
-def test_folding_batch_norm_changes_nothing() -> None:
+def test_folding_batch_norm_changes_nothing():
     network = random_network(METADATA)
     x = torch.randn(1, 3, 64, 64)
     torch.testing.assert_close(fold_batch_norm(network).predict(x), network.predict(x), rtol=1e-4, atol=1e-4)
@@ -53,7 +51,7 @@ def test_folding_batch_norm_changes_nothing() -> None:
         Metadata(variant=Variant.NNCONV5DW.value),
     ],
 )
-def test_own_graph_equals_torch(tmp_path: Path, metadata: Metadata) -> None:
+def test_own_graph_equals_torch(tmp_path, metadata):
     network = random_network(metadata)
     save_checkpoint(network, metadata, tmp_path / "w.safetensors")
     graph, record = build_graph(tmp_path / "w.safetensors")
@@ -68,7 +66,7 @@ def test_own_graph_equals_torch(tmp_path: Path, metadata: Metadata) -> None:
 
 
 @pytest.mark.slow
-def test_exported_file_holds_opset_and_metadata_and_agrees(tmp_path: Path) -> None:
+def test_exported_file_holds_opset_and_metadata_and_agrees(tmp_path):
     network = random_network(METADATA)
     path = tmp_path / "model.onnx"
     export_onnx(network, METADATA, path, ExportOptions(64, 96, opset=17))
@@ -84,7 +82,7 @@ def test_exported_file_holds_opset_and_metadata_and_agrees(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_open_dimensions_take_any_batch_and_size(tmp_path: Path) -> None:
+def test_open_dimensions_take_any_batch_and_size(tmp_path):
     network = random_network(METADATA)
     path = tmp_path / "model.onnx"
     export_onnx(network, METADATA, path, ExportOptions(64, 96, dynamic_size=True, dynamic_batch=True))
@@ -97,19 +95,19 @@ def test_open_dimensions_take_any_batch_and_size(tmp_path: Path) -> None:
             np.testing.assert_allclose(ours, theirs.numpy(), rtol=1e-4, atol=1e-4)
 
 
-def test_file_without_metadata_is_refused(tmp_path: Path) -> None:
+def test_file_without_metadata_is_refused(tmp_path):
     graph, _ = _plain_model()
     onnx.save(graph, str(tmp_path / "x.onnx"))
     with pytest.raises(WeightsError, match="no EdgeSLAM metadata"):
         read_onnx(tmp_path / "x.onnx")
 
 
-def test_opset_conversion_sets_the_ir_for_old_runtimes() -> None:
+def test_opset_conversion_sets_the_ir_for_old_runtimes():
     model, _ = _plain_model()
     assert set_opset(model, 16).ir_version == 9
 
 
-def _plain_model() -> tuple[onnx.ModelProto, str]:
+def _plain_model():
     value = onnx.helper.make_tensor_value_info
     graph = onnx.helper.make_graph(
         [onnx.helper.make_node("Relu", ["x"], ["y"])],
@@ -120,7 +118,7 @@ def _plain_model() -> tuple[onnx.ModelProto, str]:
     return onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)]), "y"
 
 
-def doubling(size: list[int | str]) -> onnx.ModelProto:
+def doubling(size):
     """Nearest-neighbour doubling between two additions, as torch exports it."""
     scales = onnx.numpy_helper.from_array(np.array([1, 1, 2, 2], np.float32), "scales")
     one = onnx.numpy_helper.from_array(np.float32(1), "one")
@@ -136,7 +134,7 @@ def doubling(size: list[int | str]) -> onnx.ModelProto:
     return onnx.shape_inference.infer_shapes(model)
 
 
-def test_doubling_by_gather_copies_the_same_values() -> None:
+def test_doubling_by_gather_copies_the_same_values():
     model = doubling([1, 3, 4, 6])
     x = np.random.default_rng(0).normal(size=(1, 3, 4, 6)).astype(np.float32)
     double_by_gather(model)
@@ -147,7 +145,7 @@ def test_doubling_by_gather_copies_the_same_values() -> None:
     np.testing.assert_array_equal(y, np.repeat(np.repeat(x + 1, 2, 2), 2, 3) + 1)
 
 
-def test_doubling_of_unknown_size_stays() -> None:
+def test_doubling_of_unknown_size_stays():
     model = doubling([1, 3, "height", "width"])
     double_by_gather(model)
     assert [node.op_type for node in model.graph.node] == ["Add", "Resize", "Add"]

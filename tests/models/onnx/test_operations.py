@@ -11,7 +11,7 @@ MACS = 8 * 5 * 6 * 3 * 9
 """Eight 3x3 filters over three channels, 5 x 6 outputs (stride 2 from 10 x 12)."""
 
 
-def network(quantised: bool, width: int | str = 12) -> onnx.ModelProto:
+def network(quantised, width=12):
     """One convolution; its image and weights are quantised or not."""
     weight = np.ones((8, 3, 3, 3), np.int8 if quantised else np.float32)
     stored = [numpy_helper.from_array(weight, "w")]
@@ -30,17 +30,17 @@ def network(quantised: bool, width: int | str = 12) -> onnx.ModelProto:
     return helper.make_model(helper.make_graph(nodes, "one", [image], [out], stored))
 
 
-def test_operations_are_those_by_hand() -> None:
+def test_operations_are_those_by_hand():
     assert count_operations(network(False)) == Operations(0, MACS, 8 * 27 * 4)
     assert count_operations(network(True)) == Operations(MACS, 0, 8 * 27)
 
 
-def test_open_size_has_no_number() -> None:
+def test_open_size_has_no_number():
     with pytest.raises(ValueError, match="size of out is open"):
         count_operations(network(False, "width"))
 
 
-def test_weights_in_constant_nodes_count_alike() -> None:
+def test_weights_in_constant_nodes_count_alike():
     model = network(False)
     moved = {tensor.name: tensor for tensor in model.graph.initializer}
     del model.graph.initializer[:]

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -22,7 +21,7 @@ GREEN = Metadata(
 """Takes RGB in [0, 1]; its metres hold for 80 px of focal length at a width of 96."""
 
 
-def write_green_network(path: Path, metres: float = 3.0) -> Path:
+def write_green_network(path, metres=3.0):
     """A network that maps green to depth: ``1 + metres green``, 10 % sure of it, at half the image's size."""
     constants = {"green": [[[[0.0]], [[metres]], [[0.0]]]], "one": [1.0], "none": 0.0, "sigma": 0.1}
     nodes = [
@@ -46,7 +45,7 @@ def write_green_network(path: Path, metres: float = 3.0) -> Path:
     return path
 
 
-def test_other_network_gives_the_slam_metres_for_its_camera(tmp_path: Path) -> None:
+def test_other_network_gives_the_slam_metres_for_its_camera(tmp_path):
     predict = DepthPredictor(write_green_network(tmp_path / "green.onnx"))
     assert predict.metadata.variant == OTHER_NETWORK
     image = np.zeros((128, 192, 3), np.uint8)
@@ -57,7 +56,7 @@ def test_other_network_gives_the_slam_metres_for_its_camera(tmp_path: Path) -> N
     np.testing.assert_allclose(depth.sigma_log, 0.1, rtol=1e-5)
 
 
-def test_the_end_of_a_networks_range_is_unknown_not_100_m(tmp_path: Path) -> None:
+def test_the_end_of_a_networks_range_is_unknown_not_100_m(tmp_path):
     predict = DepthPredictor(write_green_network(tmp_path / "far.onnx", metres=99.0))
     image = np.zeros((128, 192, 3), np.uint8)
     image[:, :96, 1] = 255
@@ -66,7 +65,7 @@ def test_the_end_of_a_networks_range_is_unknown_not_100_m(tmp_path: Path) -> Non
     np.testing.assert_allclose(depth_m[:, 102:], 1.0, rtol=1e-5)
 
 
-def test_weights_without_a_graph_cannot_be_another_network(tmp_path: Path) -> None:
+def test_weights_without_a_graph_cannot_be_another_network(tmp_path):
     widths = Widths((8, 8) + (16,) * 12, (16, 16, 16, 8, 8))
     fastdepth = Metadata(input_height=64, input_width=96, focal_px=80.0)
     with pytest.raises(WeightsError, match="other networks come as ONNX files"):

@@ -1,7 +1,5 @@
 """A simulated flight, once as a folder and once as a bag with ROS's telemetry: the same metres."""
 
-from pathlib import Path
-
 import bag_files as bags
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ LATE_S = 5.0
 """Receipt behind the headers: only the headers are right."""
 
 
-def _as_bag(flight: Path, path: Path) -> Path:
+def _as_bag(flight, path):
     source = open_source(flight)
     camera, events = source.camera, []
     k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]

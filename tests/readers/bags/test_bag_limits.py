@@ -4,7 +4,6 @@ import bz2
 import os
 import shutil
 import sqlite3
-from pathlib import Path
 
 import bag_files as bags
 import numpy as np
@@ -22,16 +21,16 @@ IMAGE = "sensor_msgs/msg/Image"
 BEGIN_S = 1.7e9
 
 
-def _pixels(index: int) -> np.ndarray:
+def _pixels(index):
     return np.random.default_rng(index).integers(0, 256, (48, 64, 3), dtype=np.uint8)
 
 
-def _pictures(first: int, count: int, topic: str = "/cam/image_raw"):
+def _pictures(first, count, topic="/cam/image_raw"):
     times = [BEGIN_S + i / 30.0 for i in range(first, first + count)]
     return [(topic, IMAGE, t, bags.picture(t, _pixels(first + i), "bgr8")) for i, t in enumerate(times)]
 
 
-def _check_read(path: Path, count: int) -> None:
+def _check_read(path, count):
     frames = list(open_source(path).frames())
     assert [round((frame.stamp_s - BEGIN_S) * 30) for frame in frames] == list(range(count))
     for i, frame in enumerate(frames):
@@ -84,7 +83,7 @@ def test_a_folder_of_pictures_with_a_bag_in_it_is_no_bag(tmp_path):
     assert "recording of ROS" not in str(caught.value)
 
 
-def _mcap_of_ros1(path: Path, profile: str, count: int, compression: bool = True) -> Path:
+def _mcap_of_ros1(path, profile, count, compression=True):
     from mcap.writer import CompressionType, Writer
     from ros1_bag import DEFINITION, _image
 
@@ -134,7 +133,7 @@ def test_sixteen_bits_of_a_thermal_camera_are_read_where_the_topic_is_named(tmp_
     assert any("16UC1" in problem.reason for problem in source.problems)
 
 
-def _database(tmp_path: Path) -> tuple[Path, sqlite3.Connection]:
+def _database(tmp_path):
     bags.write_ros2(tmp_path / "made", _pictures(0, 3))
     path = tmp_path / "a.db3"
     shutil.copy(next((tmp_path / "made").glob("*.db3")), path)
@@ -194,7 +193,7 @@ def test_decompression_stops_at_its_bound(monkeypatch):
                     chunk_bytes(name, packed)
 
 
-def _packed_ros1(path: Path) -> Path:
+def _packed_ros1(path):
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -206,7 +205,7 @@ def _packed_ros1(path: Path) -> Path:
     return path
 
 
-def _packed_ros2(path: Path, mode: str) -> Path:
+def _packed_ros2(path, mode):
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
     from rosbags.typesys import Stores, get_typestore
 

@@ -20,7 +20,7 @@ BEGIN_S = 1.7e9
 WRITERS = {"a.mcap": bags.write_mcap, "a.bag": bags.write_ros1, "a": bags.write_ros2}
 
 
-def _pixels(index: int, shape=(48, 64, 3)) -> np.ndarray:
+def _pixels(index, shape=(48, 64, 3)):
     return np.random.default_rng(index).integers(0, 256, shape, dtype=np.uint8)
 
 
@@ -33,7 +33,7 @@ def _pictures(stamps, topic="/cam/image_raw", late_s=0.01, received=None):
     ]
 
 
-def _times(count: int, hz: float = 30.0) -> list[float]:
+def _times(count, hz=30.0):
     return [BEGIN_S + i / hz for i in range(count)]
 
 
@@ -41,11 +41,11 @@ def _in_order(*series):
     return sorted((event for events in series for event in events), key=lambda event: event[2])
 
 
-def _stamps(source) -> np.ndarray:
+def _stamps(source):
     return np.array([frame.stamp_s for frame in source.frames()])
 
 
-def _reasons(source) -> str:
+def _reasons(source):
     return "\n".join(f"{problem.file}: {problem.reason}" for problem in source.problems)
 
 
@@ -248,7 +248,7 @@ def test_a_lens_that_ours_cannot_express_is_refused_in_one_line(tmp_path):
     assert math.isfinite(open_source(path, camera=_any_camera(tmp_path)).camera.fx)
 
 
-def _any_camera(folder: Path) -> Path:
+def _any_camera(folder):
     path = folder / "camera.yaml.mine"
     path.write_text("width: 64\nheight: 48\nfx: 70\nfy: 70\ncx: 31\ncy: 23\n")
     return path

@@ -21,7 +21,7 @@ def _info(model="plumb_bob", d=(), **changes):
     return SimpleNamespace(**fields)
 
 
-def _points() -> np.ndarray:
+def _points():
     x, y = np.meshgrid(np.linspace(-0.55, 0.55, 9), np.linspace(-0.42, 0.42, 9))
     return np.stack([x.ravel(), y.ravel(), np.ones(81)], axis=1)
 

@@ -1,7 +1,6 @@
 """What holds for every layout."""
 
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -25,7 +24,7 @@ def test_folder_of_something_else_is_not_recognised(layout, tmp_path):
 @pytest.mark.parametrize(
     ("name", "fx"), [("rgbd_dataset_freiburg1_desk", 517.306408), ("tum_fr2_desk", 520.908620), ("fr12_desk", None)]
 )
-def test_evaluation_and_slam_take_the_same_camera(tmp_path: Path, write_tum, name, fx):
+def test_evaluation_and_slam_take_the_same_camera(tmp_path, write_tum, name, fx):
     folder = write_tum(tmp_path / name, 2, (640, 480))
     (folder / "groundtruth.txt").write_text("100.0 0 0 0 0 0 0 1\n100.1 1 0 0 0 0 0 1\n")
     camera = open_dataset(folder).camera
@@ -83,13 +82,13 @@ def test_one_new_file_is_all_that_a_data_set_needs(tmp_path, monkeypatch, write_
         sys.modules.pop(f"{package.__name__}.garden", None)
 
 
-def stamped(i: int, factor: float, begin_s: float = 1305031102.2) -> str:
+def stamped(i, factor, begin_s=1305031102.2):
     return f"{(begin_s + i / 30) * factor:.{6 if factor == 1 else 0}f}"
 
 
 @pytest.mark.parametrize("factor", [1, 1e3, 1e6, 1e9])
 @pytest.mark.parametrize("kind", ["tum", "euroc", "kitti", "mono_vo"])
-def test_stamps_of_a_layout_may_be_in_any_unit(tmp_path: Path, write_images, kind, factor):
+def test_stamps_of_a_layout_may_be_in_any_unit(tmp_path, write_images, kind, factor):
     lists = {
         "tum": ("rgb.txt", "rgb", "{0} rgb/{1}"),
         "euroc": ("mav0/cam0/data.csv", "mav0/cam0/data", "{0},{1}"),
@@ -110,19 +109,19 @@ def test_stamps_of_a_layout_may_be_in_any_unit(tmp_path: Path, write_images, kin
 
 @pytest.mark.parametrize("begin", [0, 328551511918592, 1403636579763555584])
 @pytest.mark.parametrize("prefix", ["", "frame_", "cam0-"])
-def test_names_may_be_nanoseconds(tmp_path: Path, write_images, begin, prefix):
+def test_names_may_be_nanoseconds(tmp_path, write_images, begin, prefix):
     write_images(tmp_path, [f"{prefix}{begin + i * 33333333}.png" for i in range(12)])
     source = open_source(tmp_path)
     assert np.allclose(np.diff([frame.stamp_s for frame in source.frames()]), 1 / 30, rtol=1e-3)
 
 
-def test_an_assumed_rate_is_said(tmp_path: Path, write_images):
+def test_an_assumed_rate_is_said(tmp_path, write_images):
     write_images(tmp_path, [f"img_{i:06d}.png" for i in range(4)])
     assert any("30 images/s" in problem.reason for problem in open_source(tmp_path).problems)
 
 
 @pytest.mark.parametrize("rows", [["0.1"], ["a 0.1", "b 0.2"]])
-def test_times_that_do_not_fit_the_images_are_refused(tmp_path: Path, write_images, rows):
+def test_times_that_do_not_fit_the_images_are_refused(tmp_path, write_images, rows):
     write_images(tmp_path / "images", [f"{i}.png" for i in range(4)])
     (tmp_path / "times.txt").write_text("\n".join(rows))
     with pytest.raises(SourceError, match="times.txt"):

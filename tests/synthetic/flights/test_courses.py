@@ -8,13 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch import demo
 from edgeslam_torch.readers.source import open_source
-from edgeslam_torch.synthetic.flights.courses import (
-    BLOCK_M,
-    COURSES,
-    LOW_LIGHT,
-    RATE_HZ,
-    simulated_camera,
-)
+from edgeslam_torch.synthetic.flights.courses import BLOCK_M, COURSES, LOW_LIGHT, RATE_HZ, simulated_camera
 from edgeslam_torch.synthetic.flights.degrade import degraded
 from edgeslam_torch.synthetic.flights.flight import FlightPlan
 from edgeslam_torch.synthetic.house.render import render

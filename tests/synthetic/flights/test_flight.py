@@ -6,25 +6,24 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.synthetic.flights.flight import Flight, FlightPlan, fly
-from edgeslam_torch.synthetic.house.world import World
+from edgeslam_torch.synthetic.flights.flight import FlightPlan, fly
 from edgeslam_torch.synthetic.sites.build import place
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 
 
 @pytest.fixture(scope="module")
-def home() -> World:
+def home():
     return place("furnished_room", np.random.default_rng(3))
 
 
 @pytest.fixture(scope="module")
-def flight(home: World) -> Flight:
+def flight(home):
     return fly(np.random.default_rng(3), home, 900)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_flight_is_smooth_slow_and_clear_of_furniture(home: World, seed: int) -> None:
+def test_flight_is_smooth_slow_and_clear_of_furniture(home, seed):
     plan = FlightPlan()
     flight = fly(np.random.default_rng(seed), home, 900, plan=plan)
     speed = np.linalg.norm(flight.velocity_w, axis=1)
@@ -38,23 +37,23 @@ def test_flight_is_smooth_slow_and_clear_of_furniture(home: World, seed: int) ->
     assert home.clearance(flight.T_w_b[flying, :3, 3]).min() > plan.clearance_m - 0.1
 
 
-def test_flight_starts_low_and_climbs(flight: Flight) -> None:
+def test_flight_starts_low_and_climbs(flight):
     z = flight.T_w_b[:, 2, 3]
     assert z[0] == pytest.approx(0.4, abs=0.02)
     assert 0.7 < z[150:].min() < z.max() < 1.7
 
 
-def test_flight_velocity_is_the_derivative_of_position(flight: Flight) -> None:
+def test_flight_velocity_is_the_derivative_of_position(flight):
     difference = np.gradient(flight.T_w_b[:, :3, 3], flight.stamps_s, axis=0)
     np.testing.assert_allclose(difference[1:-1], flight.velocity_w[1:-1], atol=2e-3)
 
 
-def test_twist_carries_one_pose_to_the_next(flight: Flight) -> None:
+def test_twist_carries_one_pose_to_the_next(flight):
     k, dt = 400, 2 / 30
     there = flight.T_w_c[k - 1] @ se3.exp(flight.twist_c(k) * dt)
     np.testing.assert_allclose(there, flight.T_w_c[k + 1], atol=1e-9)
 
 
-def test_flight_without_air_is_refused(home: World) -> None:
+def test_flight_without_air_is_refused(home):
     with pytest.raises(ValueError, match="free air"):
         fly(np.random.default_rng(0), home, 30, plan=FlightPlan(clearance_m=4.0))

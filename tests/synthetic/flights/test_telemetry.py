@@ -1,7 +1,6 @@
 """Telemetry of a flight: by hand, and against the poses that it is made from."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,13 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.readers.telemetry_csv import read_telemetry
-from edgeslam_torch.synthetic.flights.flight import Flight, fly
+from edgeslam_torch.synthetic.flights.flight import fly
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, FIELDS, TelemetryFaults, simulate
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
 
 
 @pytest.fixture(scope="module")
-def flight() -> Flight:
+def flight():
     """In an empty room."""
     texture = Texture(np.zeros((4, 4, 3), np.uint8))
     floor = Quad(np.array([-4.0, 4.0, 0.0]), np.array([8.0, 0.0, 0.0]), np.array([0.0, -8.0, 0.0]), texture)
@@ -23,11 +22,11 @@ def flight() -> Flight:
     return fly(np.random.default_rng(3), room, 900)
 
 
-def simulated(flight: Flight, faults: TelemetryFaults = EXACT, **more):
+def simulated(flight, faults=EXACT, **more):
     return simulate(np.random.default_rng(0), flight.stamps_s, flight.T_w_c, flight.T_b_c, faults=faults, **more)
 
 
-def test_integrated_exact_velocity_reproduces_the_path(flight: Flight) -> None:
+def test_integrated_exact_velocity_reproduces_the_path(flight):
     log = simulated(flight)
     samples = log.samples()
     v = np.stack([s.velocity_m_s for s in samples])
@@ -39,7 +38,7 @@ def test_integrated_exact_velocity_reproduces_the_path(flight: Flight) -> None:
     np.testing.assert_allclose(moved[:-1], half[:-1] - start, atol=5e-3)
 
 
-def test_exact_attitude_height_and_force_follow_the_pose(flight: Flight) -> None:
+def test_exact_attitude_height_and_force_follow_the_pose(flight):
     log = simulated(flight, floor_m=0.0)
     samples = log.samples()
     sample = samples[120]
@@ -56,7 +55,7 @@ def test_exact_attitude_height_and_force_follow_the_pose(flight: Flight) -> None
     np.testing.assert_allclose(sample.acceleration_m_s2, force, atol=0.02)
 
 
-def test_sdk_rows_have_the_signs_and_units_of_a_tello() -> None:
+def test_sdk_rows_have_the_signs_and_units_of_a_tello():
     """Forward, up and turning left from power-on, worked out by hand: 0.5 m/s, 0.2 m/s, 10 deg/s."""
     t = np.arange(0, 4, 1 / 30)
     T_w_b = np.tile(np.eye(4), (len(t), 1, 1))
@@ -73,13 +72,13 @@ def test_sdk_rows_have_the_signs_and_units_of_a_tello() -> None:
     assert np.all(log.rows[:, :8] == np.rint(log.rows[:, :8]))
 
 
-def test_video_delay_stamps_telemetry_earlier(flight: Flight) -> None:
+def test_video_delay_stamps_telemetry_earlier(flight):
     logs = [simulated(flight, replace(EXACT, video_delay_s=d)) for d in (0.0, 0.5)]
     np.testing.assert_allclose(logs[0].stamps_s - logs[1].stamps_s, 0.5)
     np.testing.assert_array_equal(logs[0].rows, logs[1].rows)
 
 
-def test_loss_and_outage_drop_packets(flight: Flight) -> None:
+def test_loss_and_outage_drop_packets(flight):
     faults = TelemetryFaults(loss=0.3, outages_s=((10.0, 20.0),))
     log = simulated(flight, faults)
     assert not np.any((log.stamps_s >= 10.0) & (log.stamps_s < 20.0))
@@ -87,7 +86,7 @@ def test_loss_and_outage_drop_packets(flight: Flight) -> None:
     assert np.all(np.diff(log.stamps_s) >= 0)
 
 
-def test_drift_grows_as_the_battery_drains() -> None:
+def test_drift_grows_as_the_battery_drains():
     t = np.arange(0, 60, 0.1)
     T_b_c = camera_on_body()
     T_w_c = np.tile(T_b_c, (len(t), 1, 1))
@@ -102,14 +101,14 @@ def test_drift_grows_as_the_battery_drains() -> None:
     assert spread[1] > 1.8 * spread[0]
 
 
-def test_telemetry_needs_increasing_stamps(flight: Flight) -> None:
+def test_telemetry_needs_increasing_stamps(flight):
     with pytest.raises(ValueError, match="increasing stamps"):
         simulate(np.random.default_rng(0), flight.stamps_s[:3], flight.T_w_c[:3], flight.T_b_c)
     with pytest.raises(ValueError, match="increasing stamps"):
         simulate(np.random.default_rng(0), np.zeros(900), flight.T_w_c, flight.T_b_c)
 
 
-def test_csv_reader_agrees_with_our_own_conversion(tmp_path: Path, flight: Flight) -> None:
+def test_csv_reader_agrees_with_our_own_conversion(tmp_path, flight):
     log = simulated(flight, TelemetryFaults())
     log.write(tmp_path / "telemetry.csv")
     for read, own in zip(read_telemetry(tmp_path / "telemetry.csv")[0], log.samples(), strict=True):

@@ -1,7 +1,6 @@
 """Wind moves a drone as its gusts and its controller say, and leans it against the wind."""
 
 import numpy as np
-import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -12,7 +11,7 @@ from edgeslam_torch.synthetic.flights.flight import GRAVITY_M_S2
 STAMPS_S = np.arange(4000) / 20
 
 
-def test_gusts_move_it_and_it_comes_back() -> None:
+def test_gusts_move_it_and_it_comes_back():
     moved, velocity, _ = wind.blown(np.random.default_rng(0), STAMPS_S, 0.5, 0.3)
     np.testing.assert_allclose(moved[0], 0.0)
     assert (np.abs(moved.mean(0)) < 0.02).all(), "the steady wind is held against"
@@ -21,13 +20,13 @@ def test_gusts_move_it_and_it_comes_back() -> None:
     np.testing.assert_allclose(np.gradient(moved, STAMPS_S, axis=0)[1:-1], velocity[1:-1], atol=0.02)
 
 
-def test_lean_and_gust_together_are_the_acceleration(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lean_and_gust_together_are_the_acceleration(monkeypatch):
     """A gust that never changes: a damped spring pushed by it, by an integrator that is not ours."""
     monkeypatch.setattr(wind, "GUST_S", 1e9)
     rng = np.random.default_rng(1)
 
     class Constant:
-        def normal(self, mean: float, sigma: float, shape: tuple[int, int]) -> np.ndarray:
+        def normal(self, mean, sigma, shape):
             shocks = np.zeros(shape)
             shocks[1] = 1.0
             return shocks
@@ -35,9 +34,9 @@ def test_lean_and_gust_together_are_the_acceleration(monkeypatch: pytest.MonkeyP
         uniform = rng.uniform
 
     stamps = np.arange(0.0, 4.0, 0.05)
-    moved, velocity, lean = wind.blown(Constant(), stamps, 0.0, 0.2)  # type: ignore[arg-type]
+    moved, velocity, lean = wind.blown(Constant(), stamps, 0.0, 0.2)
 
-    def spring(t: float, state: np.ndarray) -> list[float]:
+    def spring(t, state):
         pushed = 1.0 if t > wind.STEP_S else 0.0
         return [state[1], pushed - wind.STIFFNESS_S2 * state[0] - wind.DAMPING_S * state[1]]
 
@@ -48,13 +47,13 @@ def test_lean_and_gust_together_are_the_acceleration(monkeypatch: pytest.MonkeyP
     np.testing.assert_allclose((lean[:, 0] + 1.0)[2:-1], acceleration[2:-1], atol=0.03)
 
 
-def test_a_drone_leans_against_a_steady_wind() -> None:
+def test_a_drone_leans_against_a_steady_wind():
     _, _, lean = wind.blown(np.random.default_rng(2), STAMPS_S, 0.5, 0.0)
     np.testing.assert_allclose(np.linalg.norm(lean, axis=1), 0.5)
     assert (lean == lean[0]).all()
 
 
-def test_a_windy_course_keeps_clear_and_leans() -> None:
+def test_a_windy_course_keeps_clear_and_leans():
     world, flight, _ = flown(COURSES["windy_blank_corridor"], 0)
     assert world.clearance(flight.T_w_b[:, :3, 3]).min() > 0.2
     _, still, _ = flown(COURSES["blank_corridor"], 0)

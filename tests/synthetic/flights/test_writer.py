@@ -1,7 +1,5 @@
 """A flight on disk."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -15,23 +13,22 @@ from edgeslam_torch.synthetic.flights.flight import Flight, fly
 from edgeslam_torch.synthetic.flights.telemetry import simulate
 from edgeslam_torch.synthetic.flights.writer import DEPTH_PER_METRE, write_flight
 from edgeslam_torch.synthetic.house.render import render
-from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.synthetic.sites.build import place
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 
 
 @pytest.fixture(scope="module")
-def home() -> World:
+def home():
     return place("furnished_room", np.random.default_rng(3))
 
 
 @pytest.fixture(scope="module")
-def flight(home: World) -> Flight:
+def flight(home):
     return fly(np.random.default_rng(3), home, 900)
 
 
-def test_written_flight_is_read_back(tmp_path: Path, home: World, flight: Flight) -> None:
+def test_written_flight_is_read_back(tmp_path, home, flight):
     short = Flight(flight.stamps_s[200:206], flight.T_w_b[200:206], flight.T_b_c, flight.velocity_w[200:206])
     log = simulate(np.random.default_rng(0), flight.stamps_s, flight.T_w_c, flight.T_b_c)
     write_flight(tmp_path / "f", home, short, CAMERA, telemetry=log, faults=CameraFaults(), depth_every=2)
@@ -50,7 +47,7 @@ def test_written_flight_is_read_back(tmp_path: Path, home: World, flight: Flight
     np.testing.assert_allclose(written.T_w_c[2], short.T_w_c[2], atol=1e-8)
 
 
-def test_threads_do_not_change_the_images(tmp_path: Path, home: World, flight: Flight) -> None:
+def test_threads_do_not_change_the_images(tmp_path, home, flight):
     short = Flight(flight.stamps_s[200:206], flight.T_w_b[200:206], flight.T_b_c, flight.velocity_w[200:206])
     for threads in (1, 3):
         write_flight(tmp_path / f"{threads}", home, short, CAMERA, faults=CameraFaults(), threads=threads)

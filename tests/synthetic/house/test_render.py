@@ -17,11 +17,11 @@ CAMERA = Camera(320, 240, 260.0, 255.0, 161.3, 118.2)
 
 
 @pytest.fixture(scope="module")
-def furnished() -> World:
+def furnished():
     return place("furnished_room", np.random.default_rng(3))
 
 
-def cast_rays(world: World, T_w_c: np.ndarray, rays_c: np.ndarray) -> np.ndarray:
+def cast_rays(world, T_w_c, rays_c):
     """z-depth of rays with unit z by intersecting every quad, float64: the independent reference."""
     best = np.full(len(rays_c), np.inf)
     rays_w, origin = rays_c @ T_w_c[:3, :3].T, T_w_c[:3, 3]
@@ -38,12 +38,12 @@ def cast_rays(world: World, T_w_c: np.ndarray, rays_c: np.ndarray) -> np.ndarray
     return best
 
 
-def pixel_rays(camera: Camera, uv: np.ndarray) -> np.ndarray:
+def pixel_rays(camera, uv):
     ideal = camera.undistort_points(uv).astype(np.float64)
     return camera.back_project(ideal, np.ones(len(uv)))
 
 
-def test_depth_equals_analytic_ray_cast(furnished: World) -> None:
+def test_depth_equals_analytic_ray_cast(furnished):
     rng = np.random.default_rng(0)
     T_w_c = random_pose(rng, furnished)
     uv = rng.integers(0, [CAMERA.width, CAMERA.height], (600, 2))
@@ -52,12 +52,12 @@ def test_depth_equals_analytic_ray_cast(furnished: World) -> None:
     np.testing.assert_allclose(view.depth_m[uv[:, 1], uv[:, 0]], truth, rtol=2e-6)
 
 
-def test_a_distorted_camera_is_refused(furnished: World) -> None:
+def test_a_distorted_camera_is_refused(furnished):
     with pytest.raises(ValueError, match="no distortion"):
         render(furnished, PRESETS["tum_fr1"], look(np.zeros(3), 0.0))
 
 
-def test_a_sheet_straight_ahead_is_seen_from_its_front_or_from_both_sides() -> None:
+def test_a_sheet_straight_ahead_is_seen_from_its_front_or_from_both_sides():
     grey = Texture(np.full((8, 8, 3), 100, np.uint8))
     wall = Quad(np.array([3.0, 5.0, 5.0]), np.array([0.0, -10.0, 0.0]), np.array([0.0, 0.0, -10.0]), grey)
     view = render(World([wall]), CAMERA, look(np.zeros(3), 0.0))
@@ -68,7 +68,7 @@ def test_a_sheet_straight_ahead_is_seen_from_its_front_or_from_both_sides() -> N
     assert np.all(render(World([replace(wall, two_sided=True)]), CAMERA, behind).quad_id == 0)
 
 
-def test_texture_corner_is_drawn_where_it_projects() -> None:
+def test_texture_corner_is_drawn_where_it_projects():
     """A chequered wall seen obliquely: sub-pixel corners of the drawing against projected 3-D corners."""
     cells, px = 8, 64
     board = (np.indices((cells, cells)).sum(0) % 2 * 200 + 25).astype(np.uint8)
@@ -92,7 +92,7 @@ def test_texture_corner_is_drawn_where_it_projects() -> None:
     assert np.linalg.norm(np.mean(found[:, 0] - uv[inside], axis=0)) < 0.02  # no systematic half pixel
 
 
-def test_quad_border_is_drawn_where_it_projects() -> None:
+def test_quad_border_is_drawn_where_it_projects():
     """The blend at a vertical border puts the edge within 0.1 px (five samples a pixel)."""
     white, black = (Texture(np.full((8, 8, 3), g, np.uint8)) for g in (220, 20))
     far = Quad(np.array([4.0, 9.0, 9.0]), np.array([0.0, -18.0, 0.0]), np.array([0.0, 0.0, -18.0]), black)
@@ -110,7 +110,7 @@ def test_quad_border_is_drawn_where_it_projects() -> None:
         assert np.abs(edge - truth).max() < 0.4
 
 
-def test_world_without_quads_is_refused() -> None:
+def test_world_without_quads_is_refused():
     with pytest.raises(ValueError, match="1 to 32767 quads"):
         World([])
 

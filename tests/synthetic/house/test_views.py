@@ -9,14 +9,14 @@ from edgeslam_torch.synthetic.house.views import look, random_pose, random_room,
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 
 
-def test_pose_looks_along_its_yaw_and_tilt() -> None:
+def test_pose_looks_along_its_yaw_and_tilt():
     T_w_c = look(np.array([1.0, 2.0, 3.0]), np.pi / 2, 0.2)
     np.testing.assert_allclose(T_w_c[:3, 2], [0, np.cos(0.2), -np.sin(0.2)], atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(T_w_c[:3, :3]), 1.0)
     assert T_w_c[2, 1] < 0  # image down is world down
 
 
-def test_random_rooms_are_closed_sensible_textured_and_the_same_for_a_seed() -> None:
+def test_random_rooms_are_closed_sensible_textured_and_the_same_for_a_seed():
     views = []
     for seed in (5, 6):
         rng = np.random.default_rng(seed)

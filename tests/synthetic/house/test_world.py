@@ -8,19 +8,19 @@ from edgeslam_torch.synthetic.house.world import Box, Boxes, Quad, Texture, Worl
 FLAT = Texture(np.full((8, 8, 3), 9, np.uint8))
 
 
-def level(x: float, y: float, z: float, size: float) -> Quad:
+def level(x, y, z, size):
     """Level square by its corner of low x and high y."""
     return Quad(np.array([x, y, z]), np.array([size, 0.0, 0.0]), np.array([0.0, -size, 0.0]), FLAT)
 
 
-def test_floor_and_distance_to_surfaces() -> None:
+def test_floor_and_distance_to_surfaces():
     world = World([level(-3, 3, 0, 6), level(0, 1, 0.7, 1)])
     p = np.array([[0.5, 0.5, 1.2], [0.5, 0.5, 0.4], [2.0, 2.0, 1.2], [5.0, 0.0, 0.0]])
     np.testing.assert_allclose(world.floor_below(p)[:3], [0.7, 0.0, 0.0])
     np.testing.assert_allclose(world.distance_to_surface(p), [0.5, 0.3, 1.2, 2.0])
 
 
-def test_clearance_is_the_distance_to_the_nearest_wall_or_solid() -> None:
+def test_clearance_is_the_distance_to_the_nearest_wall_or_solid():
     turned = Box(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.1, 1.0]), np.pi / 2)
     world = World([level(-3, 3, 0, 6)], bounds_w=np.array([[-3, -3, 0], [3, 3, 2.5]]), boxes=[turned])
     p = np.array([[1.1, 0.5, 1.0], [0.0, 1.5, 1.0], [2.9, 0.0, 1.0], [0.05, 0.9, 1.0], [3.5, 0.0, 1.0]])
@@ -30,6 +30,6 @@ def test_clearance_is_the_distance_to_the_nearest_wall_or_solid() -> None:
 
 
 @pytest.mark.parametrize("image", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3))])
-def test_a_texture_is_8_bit_colour(image: np.ndarray) -> None:
+def test_a_texture_is_8_bit_colour(image):
     with pytest.raises(ValueError, match="uint8"):
         Texture(image)

@@ -7,24 +7,24 @@ import numpy as np
 from edgeslam_torch.synthetic.textures.image_ops import looked_up, product, resized, shrunk
 
 
-def test_a_product_is_the_nearest_grey_level() -> None:
+def test_a_product_is_the_nearest_grey_level():
     a, b = np.meshgrid(np.arange(256, dtype=np.uint8), np.arange(256, dtype=np.uint8))
     nearest = (2 * a.astype(int) * b + 255) // 510  # a b / 255 never lies between two levels
     np.testing.assert_array_equal(product(a, b / np.float32(255)), nearest)
 
 
-def test_a_product_saturates() -> None:
+def test_a_product_saturates():
     assert product(np.array([[200]], np.uint8), np.array([[1.5]], np.float32)).tolist() == [[255]]
 
 
-def test_a_mean_is_exact_and_halves_go_up() -> None:
+def test_a_mean_is_exact_and_halves_go_up():
     image = np.random.default_rng(0).integers(0, 256, (35, 10, 3), dtype=np.uint8)
     out = shrunk(image, 7, 25)
     for row, column, channel in np.ndindex(out.shape):
         assert out[row, column, channel] == _area_mean(image[..., channel], row, column, 25, 7)
 
 
-def _area_mean(image: np.ndarray, row: int, column: int, height: int, width: int) -> int:
+def _area_mean(image, row, column, height, width):
     """Mean of the source under one pixel by fractions, to the nearest level, halves up."""
     down, across = Fraction(image.shape[0], height), Fraction(image.shape[1], width)
     rows = [_overlap(i, row * down, (row + 1) * down) for i in range(image.shape[0])]
@@ -33,18 +33,18 @@ def _area_mean(image: np.ndarray, row: int, column: int, height: int, width: int
     return int(total / (down * across) + Fraction(1, 2))
 
 
-def _overlap(pixel: int, low: Fraction, high: Fraction) -> Fraction:
+def _overlap(pixel, low, high):
     return max(Fraction(0), min(high, Fraction(pixel + 1)) - max(low, Fraction(pixel)))
 
 
-def test_interpolation_meets_a_ramp() -> None:
+def test_interpolation_meets_a_ramp():
     ramp = np.arange(0, 250, 10, dtype=np.uint8)[None].repeat(4, axis=0)
     out = resized(ramp, 100, 4)
     inside = 10 * ((np.arange(100) + 0.5) / 4 - 0.5)
     np.testing.assert_allclose(out[0, 4:-4], inside[4:-4], atol=0.51)
 
 
-def test_a_look_up_is_exact_at_steps_of_a_256th() -> None:
+def test_a_look_up_is_exact_at_steps_of_a_256th():
     rng = np.random.default_rng(1)
     image = rng.integers(0, 256, (50, 70, 3), dtype=np.uint8)
     x, y = np.rint(256 * rng.uniform(0, [69, 49], (40, 60, 2))).astype(int).transpose(2, 0, 1)
@@ -58,6 +58,6 @@ def test_a_look_up_is_exact_at_steps_of_a_256th() -> None:
     np.testing.assert_array_equal(looked_up(image, x / 256, y / 256), expected)
 
 
-def test_the_border_goes_on_outside() -> None:
+def test_the_border_goes_on_outside():
     image = np.arange(12, dtype=np.uint8).reshape(3, 4)
     assert looked_up(image, np.array([[-9.0, 99.0]]), np.array([[99.0, -1.0]])).tolist() == [[8, 3]]

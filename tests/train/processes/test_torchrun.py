@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 import torch
@@ -25,29 +24,29 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_TH
 
 
 @pytest.fixture
-def weights(tmp_path: Path) -> Path:
+def weights(tmp_path):
     torch.manual_seed(0)
     save_checkpoint(build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5)), METADATA, tmp_path / "w.safetensors")
     return tmp_path / "w.safetensors"
 
 
-def words(run_folder: Path, weights: Path, out: Path, steps: int) -> list[str]:
+def words(run_folder, weights, out, steps):
     given = (run_folder, "--weights", weights, "--out", out, "--steps", steps, "--batch", 4, "--lr", 0.01)
     return ["finetune", *map(str, given)]
 
 
-def run(*command: str) -> subprocess.CompletedProcess[str]:
+def run(*command):
     return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=280, check=False)
 
 
-def assert_close(first: Path, second: Path) -> None:
+def assert_close(first, second):
     """The same images and terms, added up in another order, stored in half precision."""
     one, other = (load_checkpoint(p)[0].state_dict() for p in (first, second))
     for name, value in one.items():
         torch.testing.assert_close(other[name], value, rtol=4e-3, atol=1e-3, msg=name)
 
 
-def test_two_processes_give_the_weights_of_one(run_folder: Path, weights: Path, tmp_path: Path) -> None:
+def test_two_processes_give_the_weights_of_one(run_folder, weights, tmp_path):
     alone, together = tmp_path / "alone", tmp_path / "together"
     assert run(sys.executable, *MODULE, *words(run_folder, weights, alone, 8)).returncode == 0
     for _ in range(2):  # the second finds all of it done
@@ -59,16 +58,14 @@ def test_two_processes_give_the_weights_of_one(run_folder: Path, weights: Path, 
     assert len(list((together / "teacher").rglob("swept_*.npy"))) == 11
 
 
-def test_more_processes_than_images_are_refused(run_folder: Path, weights: Path, tmp_path: Path) -> None:
+def test_more_processes_than_images_are_refused(run_folder, weights, tmp_path):
     done = run(*TORCHRUN, *MODULE, *words(run_folder, weights, tmp_path / "out", 4), "--batch", "1")
     assert done.returncode == 1
     assert "2 processes for a batch of 1" in done.stderr
 
 
 @pytest.mark.parametrize("killed", [0, 1])
-def test_killed_process_ends_the_other_clearly_and_training_goes_on(
-    run_folder: Path, weights: Path, tmp_path: Path, killed: int
-) -> None:
+def test_killed_process_ends_the_other_clearly_and_training_goes_on(run_folder, weights, tmp_path, killed):
     out = tmp_path / "out"
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -13,21 +13,20 @@ from posed_run import CAMERA, world
 from edgeslam_torch.commands.training import distil as command
 from edgeslam_torch.errors import ConfigError, SourceError
 from edgeslam_torch.models.checkpoint import load_checkpoint
-from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.layout import Variant
 from edgeslam_torch.models.onnx.graph import build_graph
-from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata
+from edgeslam_torch.models.record import DEFAULT_WEIGHTS
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.train.calibrate_sigma import coverage, residuals_and_sigma
 from edgeslam_torch.train.recipes.distil import brought_to_map, label, log_metres, new_student
 from edgeslam_torch.train.teachers import teach
 from edgeslam_torch.train.views.augment import View
-from edgeslam_torch.train.views.posed import PosedSequence, PosedView, load_run
-from edgeslam_torch.types import DepthMap, FloatArray
+from edgeslam_torch.train.views.posed import load_run
+from edgeslam_torch.types import DepthMap
 
 
 @pytest.fixture(scope="module")
-def sequence(run_folder: Path) -> PosedSequence:
+def sequence(run_folder):
     return load_run(run_folder)
 
 
@@ -37,26 +36,26 @@ class Oracle:
     weights = Path("oracle.onnx")
     backend = "none"
 
-    def __init__(self, sequence: PosedSequence, change=lambda z: z, relative: bool = False) -> None:
+    def __init__(self, sequence, change=lambda z: z, relative=False):
         self.poses = {v.image.tobytes(): v.T_w_c for v in sequence.views}
         self.change, self.is_metric = change, not relative
 
-    def __call__(self, image, camera) -> DepthMap:
+    def __call__(self, image, camera):
         true = cv2.resize(true_depth(self.poses[image.tobytes()]), (camera.width, camera.height))
         depth = self.change(true).astype(np.float32)
         return DepthMap(depth, np.full_like(depth, 0.2), is_relative=not self.is_metric)
 
 
-def true_depth(T_w_c: FloatArray) -> FloatArray:
+def true_depth(T_w_c):
     return render(world(), CAMERA, T_w_c).depth_m
 
 
-def error(depth: FloatArray, T_w_c: FloatArray) -> FloatArray:
+def error(depth, T_w_c):
     height, width = depth.shape
     return np.abs(depth / cv2.resize(true_depth(T_w_c), (width, height), interpolation=cv2.INTER_NEAREST) - 1)
 
 
-def test_metres_are_the_teachers(sequence: PosedSequence) -> None:
+def test_metres_are_the_teachers(sequence):
     assert log_metres(Oracle(sequence, lambda z: 1.3 * z), sequence) == pytest.approx(np.log(1.3), abs=0.01)
     with pytest.raises(SourceError, match="gives no metres"):
         log_metres(Oracle(sequence, relative=True), sequence)
@@ -67,22 +66,20 @@ def test_metres_are_the_teachers(sequence: PosedSequence) -> None:
     [(lambda z: 0.6 * z, False), (lambda z: 1.0 / (0.4 / z + 0.3), True)],
     ids=["another scale", "relative"],
 )
-def test_teacher_is_brought_to_the_map(sequence: PosedSequence, change, relative: bool) -> None:
+def test_teacher_is_brought_to_the_map(sequence, change, relative):
     view = sequence.views[3]
     depth = brought_to_map(Oracle(sequence, change, relative), view, float(np.log(2.0)))
     assert np.median(error(depth / 2.0, view.T_w_c)) < 0.01
 
 
-def test_teacher_that_takes_near_for_far_is_not_believed(sequence: PosedSequence, tmp_path: Path) -> None:
+def test_teacher_that_takes_near_for_far_is_not_believed(sequence, tmp_path):
     wrong = Oracle(sequence, lambda z: 2.0 / z, relative=True)
     assert brought_to_map(wrong, sequence.views[3], 0.0) is None
     with pytest.raises(SourceError, match=r"oracle\.onnx agrees with the map in none"):
         label(wrong, sequence, 0.0, tmp_path)
 
 
-def test_labels_are_measured_where_they_can_be_and_the_teachers_elsewhere(
-    sequence: PosedSequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_labels_are_measured_where_they_can_be_and_the_teachers_elsewhere(sequence, tmp_path, monkeypatch):
     monkeypatch.setattr(teach, "MOST", 4)
     labels = label(Oracle(sequence, lambda z: 1.0 / (0.4 / z + 0.3), relative=True), sequence, 0.0, tmp_path)
     assert labels.without == 0 and 0.2 < labels.measured < 1.0
@@ -93,7 +90,7 @@ def test_labels_are_measured_where_they_can_be_and_the_teachers_elsewhere(
 
 
 @pytest.mark.parametrize("variant", [Variant.PRUNED, Variant.NNCONV5DW])
-def test_student_begins_with_what_fits_of_the_shipped_weights(variant: Variant) -> None:
+def test_student_begins_with_what_fits_of_the_shipped_weights(variant):
     student, metadata = new_student(variant)
     shipped = load_checkpoint(None)[0]
     same = [
@@ -106,11 +103,11 @@ def test_student_begins_with_what_fits_of_the_shipped_weights(variant: Variant) 
     assert all(torch.equal(v, again[k]) for k, v in student.state_dict().items()), "a training can be resumed"
 
 
-def values(layer: torch.nn.Module) -> list[torch.Tensor]:
+def values(layer):
     return list(layer.state_dict().values())
 
 
-def teacher_file(path: Path) -> Path:
+def teacher_file(path):
     """The shipped network, as a relative network of somebody else."""
     content, metadata = build_graph(DEFAULT_WEIGHTS)
     model = onnx.load_model_from_string(content)
@@ -128,18 +125,18 @@ def teacher_file(path: Path) -> Path:
     return path
 
 
-def true_small(view: PosedView) -> FloatArray:
+def true_small(view):
     height, width = view.image.shape[:2]
     return cv2.resize(true_depth(view.T_w_c), (width, height), interpolation=cv2.INTER_NEAREST)
 
 
-def coverage_of(network: FastDepth, metadata: Metadata, views: list[View]) -> float:
+def coverage_of(network, metadata, views):
     """Share of true log depth within one sigma."""
     residuals, raw = residuals_and_sigma(network, metadata, views)
     return coverage(residuals, np.hypot(metadata.sigma_scale * raw, metadata.sigma_floor))[0]
 
 
-def arguments(tmp_path: Path, *words: object) -> argparse.Namespace:
+def arguments(tmp_path, *words):
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)
     given = ("--out", tmp_path / "out", "--steps", "2", "--batch", "2", *words)
@@ -147,9 +144,7 @@ def arguments(tmp_path: Path, *words: object) -> argparse.Namespace:
 
 
 @pytest.mark.slow
-def test_distil_command_writes_weights_and_says_what_was_learnt(
-    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_distil_command_writes_weights_and_says_what_was_learnt(run_folder, tmp_path, capsys):
     teacher = teacher_file(tmp_path / "teacher.onnx")
     words = (run_folder, "--teacher", teacher, "--depth", "mobilenet-nnconv5dw-skipadd-pruned")
     assert command.main(arguments(tmp_path, *words)) == 0
@@ -165,6 +160,6 @@ def test_distil_command_writes_weights_and_says_what_was_learnt(
     assert "nothing was left to train" in capsys.readouterr().out
 
 
-def test_student_that_nobody_knows_is_named(run_folder: Path, tmp_path: Path) -> None:
+def test_student_that_nobody_knows_is_named(run_folder, tmp_path):
     with pytest.raises(ConfigError, match="mobilenet-nnconv5dw-skipadd-pruned"):
         command.main(arguments(tmp_path, run_folder, "--teacher", "default", "--student", "small"))

@@ -21,7 +21,7 @@ from edgeslam_torch.models.fastdepth import Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import recipe
 from edgeslam_torch.train.callbacks import ProgressBar
-from edgeslam_torch.train.state import TrainState, saved_step
+from edgeslam_torch.train.state import saved_step
 from edgeslam_torch.writers.own_folder import FolderLock
 
 METADATA = Metadata(
@@ -33,7 +33,7 @@ Finetune = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(scope="module")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recordings(tmp_path_factory):
     """Two recordings with depth, and weights to begin with."""
     root = tmp_path_factory.mktemp("recordings")
     write_folder(root / "kitchen")
@@ -45,16 +45,16 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def finetune(recordings: Path, tmp_path: Path) -> Finetune:
+def finetune(recordings, tmp_path):
     """Runs the command on named recordings into ``tmp_path/out``; returns exit code, stdout and stderr."""
 
-    def call(*words: str, steps: int = 8, out: Path = tmp_path / "out") -> tuple[int, str, str]:
+    def call(*words, steps=8, out=tmp_path / "out"):
         return _finetune(recordings, *words, steps=steps, out=out)
 
     return call
 
 
-def _finetune(recordings: Path, *words: str, steps: int, out: Path) -> tuple[int, str, str]:
+def _finetune(recordings, *words, steps, out):
     given = [str(recordings / w) if (recordings / w).exists() else w for w in words]
     if "--weights" not in given:
         given += ["--weights", str(recordings / "start.safetensors")]
@@ -65,7 +65,7 @@ def _finetune(recordings: Path, *words: str, steps: int, out: Path) -> tuple[int
 
 
 @pytest.fixture(scope="module")
-def eight_steps(recordings: Path) -> tuple[Path, str]:
+def eight_steps(recordings):
     """A whole run on the kitchen, shared by the tests, and its output."""
     folder = recordings / "eight steps"
     code, stdout, _ = _finetune(recordings, "kitchen", steps=8, out=folder)
@@ -74,16 +74,16 @@ def eight_steps(recordings: Path) -> tuple[Path, str]:
 
 
 @pytest.fixture
-def trained(eight_steps: tuple[Path, str], tmp_path: Path) -> Path:
+def trained(eight_steps, tmp_path):
     """A copy of that run in ``tmp_path/out``."""
     return Path(shutil.copytree(eight_steps[0], tmp_path / "out"))
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def refused(answer: tuple[int, str, str], *words: str) -> None:
+def refused(answer, *words):
     code, _, stderr = answer
     assert code == 1
     errors = [line for line in stderr.splitlines() if line.startswith("edgeslam: error:")]
@@ -93,9 +93,7 @@ def refused(answer: tuple[int, str, str], *words: str) -> None:
 
 
 @pytest.mark.slow
-def test_before_and_after_are_reported_and_weights_say_what_they_are(
-    finetune: Finetune, recordings: Path, tmp_path: Path
-) -> None:
+def test_before_and_after_are_reported_and_weights_say_what_they_are(finetune, recordings, tmp_path):
     folder = shutil.copytree(recordings / "kitchen", tmp_path / "kitchen")
     (folder / "rgb" / "3.png").write_bytes(b"broken")
     code, stdout, stderr = finetune(str(folder), steps=60)
@@ -116,9 +114,7 @@ def test_before_and_after_are_reported_and_weights_say_what_they_are(
     assert set(modes.values()) == {oct(0o666 & ~umask)}, modes
 
 
-def test_other_data_into_the_same_folder_is_refused_and_nothing_changes(
-    finetune: Finetune, trained: Path, tmp_path: Path
-) -> None:
+def test_other_data_into_the_same_folder_is_refused_and_nothing_changes(finetune, trained, tmp_path):
     before = contents(tmp_path / "out")
     refused(finetune("hall"), "data: kitchen (depth) then, hall (depth) now", "--overwrite")
     refused(finetune("kitchen", "hall"), "kitchen (depth), hall (depth) now")
@@ -130,7 +126,7 @@ def test_other_data_into_the_same_folder_is_refused_and_nothing_changes(
     assert contents(tmp_path / "out") == before
 
 
-def test_other_weights_are_refused(finetune: Finetune, trained: Path, tmp_path: Path) -> None:
+def test_other_weights_are_refused(finetune, trained, tmp_path):
     torch.manual_seed(1)
     network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
     save_checkpoint(network, METADATA, tmp_path / "other.safetensors")
@@ -140,7 +136,7 @@ def test_other_weights_are_refused(finetune: Finetune, trained: Path, tmp_path: 
     assert own.is_file()
 
 
-def test_data_that_changed_on_disk_is_refused(finetune: Finetune, recordings: Path, tmp_path: Path) -> None:
+def test_data_that_changed_on_disk_is_refused(finetune, recordings, tmp_path):
     folder = shutil.copytree(recordings / "kitchen", tmp_path / "kitchen")
     finetune(str(folder))
     before = contents(tmp_path / "out")
@@ -152,7 +148,7 @@ def test_data_that_changed_on_disk_is_refused(finetune: Finetune, recordings: Pa
 
 
 @pytest.mark.slow
-def test_moved_data_and_folder_go_on(finetune: Finetune, recordings: Path, tmp_path: Path) -> None:
+def test_moved_data_and_folder_go_on(finetune, recordings, tmp_path):
     folder = shutil.copytree(recordings / "kitchen", tmp_path / "here" / "kitchen")
     finetune(str(folder), out=tmp_path / "first")
     shutil.move(tmp_path / "here", tmp_path / "there")
@@ -162,9 +158,7 @@ def test_moved_data_and_folder_go_on(finetune: Finetune, recordings: Path, tmp_p
     assert "goes on after step 8" in stdout
 
 
-def test_same_command_again_trains_nothing_and_says_so(
-    finetune: Finetune, eight_steps: tuple[Path, str], trained: Path, tmp_path: Path
-) -> None:
+def test_same_command_again_trains_nothing_and_says_so(finetune, eight_steps, trained, tmp_path):
     first = eight_steps[1].replace(str(eight_steps[0]), str(trained))
     before = contents(tmp_path / "out")
     code, second, _ = finetune("kitchen")
@@ -174,7 +168,7 @@ def test_same_command_again_trains_nothing_and_says_so(
     assert contents(tmp_path / "out") == before
 
 
-def test_more_steps_go_on_and_fewer_are_refused(finetune: Finetune, trained: Path, tmp_path: Path) -> None:
+def test_more_steps_go_on_and_fewer_are_refused(finetune, trained, tmp_path):
     code, stdout, _ = finetune("kitchen", steps=12)
     assert code == 0
     assert "goes on after step 8" in stdout
@@ -187,9 +181,7 @@ def test_more_steps_go_on_and_fewer_are_refused(finetune: Finetune, trained: Pat
 
 
 @pytest.mark.slow
-def test_resume_takes_another_rate_and_needs_something_to_resume(
-    finetune: Finetune, trained: Path, tmp_path: Path
-) -> None:
+def test_resume_takes_another_rate_and_needs_something_to_resume(finetune, trained, tmp_path):
     refused(finetune("kitchen", "--resume", out=tmp_path / "new"), "nothing to resume")
     assert not (tmp_path / "new").exists()
     refused(finetune("kitchen", "--lr", "0.001", steps=10), "lr: 0.01 then, 0.001 now", "--resume")
@@ -197,7 +189,7 @@ def test_resume_takes_another_rate_and_needs_something_to_resume(
 
 
 @pytest.mark.slow
-def test_overwrite_begins_anew_and_keeps_the_old_one_until_the_data_is_read(finetune: Finetune, tmp_path: Path) -> None:
+def test_overwrite_begins_anew_and_keeps_the_old_one_until_the_data_is_read(finetune, tmp_path):
     finetune("kitchen", steps=10)
     before = contents(tmp_path / "out")
     broken = write_folder(tmp_path / "broken", 2)
@@ -209,7 +201,7 @@ def test_overwrite_begins_anew_and_keeps_the_old_one_until_the_data_is_read(fine
     assert saved_step(tmp_path / "out" / "last.pt") == 8
 
 
-def test_files_that_no_finetuning_wrote_are_left_alone(finetune: Finetune, recordings: Path, tmp_path: Path) -> None:
+def test_files_that_no_finetuning_wrote_are_left_alone(finetune, recordings, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "weights.safetensors").write_bytes(b"somebody's")
     for words in (("kitchen",), ("kitchen", "--overwrite")):
@@ -222,20 +214,20 @@ def test_files_that_no_finetuning_wrote_are_left_alone(finetune: Finetune, recor
     assert contents(own) == before
 
 
-def test_damaged_record_is_named(finetune: Finetune, trained: Path, tmp_path: Path) -> None:
+def test_damaged_record_is_named(finetune, trained, tmp_path):
     for text in ("", "{}", "[1]", '{"given": {"weights": 1, "data": 5}}', "[" * 100_000):
         (tmp_path / "out" / "finetune.json").write_text(text)
         refused(finetune("kitchen"), "finetune.json: unreadable")
 
 
-def test_two_at_the_same_time_are_refused(finetune: Finetune, tmp_path: Path) -> None:
+def test_two_at_the_same_time_are_refused(finetune, tmp_path):
     (tmp_path / "out").mkdir()
     lock = FolderLock(tmp_path / "out")
     refused(finetune("kitchen"), f"process {os.getpid()}")
     lock.release()
 
 
-def test_out_that_cannot_be_written_is_one_line(finetune: Finetune, tmp_path: Path) -> None:
+def test_out_that_cannot_be_written_is_one_line(finetune, tmp_path):
     (tmp_path / "file").write_text("a file")
     refused(finetune("kitchen", out=tmp_path / "file"), str(tmp_path / "file"), "exists")
     refused(finetune("kitchen", out=tmp_path / "file" / "below"), "Not a directory")
@@ -255,18 +247,14 @@ def test_out_that_cannot_be_written_is_one_line(finetune: Finetune, tmp_path: Pa
         (("--validate", "start.safetensors"), "no recording with depth"),
     ],
 )
-def test_mistakes_are_named_before_anything_is_written(
-    finetune: Finetune, tmp_path: Path, wrong: tuple[str, ...], said: str
-) -> None:
+def test_mistakes_are_named_before_anything_is_written(finetune, tmp_path, wrong, said):
     refused(finetune("kitchen", *wrong), said)
     refused(finetune("kitchen", steps=0), "--steps must be at least 1")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
-def test_depth_too_far_to_validate_on_is_learnt_from_all_the_same(
-    finetune: Finetune, recordings: Path, tmp_path: Path
-) -> None:
+def test_depth_too_far_to_validate_on_is_learnt_from_all_the_same(finetune, recordings, tmp_path):
     far = shutil.copytree(recordings / "kitchen", tmp_path / "far")
     for path in (far / "depth").iterdir():
         cv2.imwrite(str(path), np.full((48, 64), 20_000, np.uint16))
@@ -277,9 +265,7 @@ def test_depth_too_far_to_validate_on_is_learnt_from_all_the_same(
 
 
 @pytest.mark.slow
-def test_what_made_nothing_better_keeps_the_weights_it_began_with(
-    finetune: Finetune, recordings: Path, tmp_path: Path
-) -> None:
+def test_what_made_nothing_better_keeps_the_weights_it_began_with(finetune, recordings, tmp_path):
     finetune("kitchen", steps=40, out=tmp_path / "good")
     good = tmp_path / "good" / "weights.safetensors"
     noise = shutil.copytree(recordings / "kitchen", tmp_path / "noise")
@@ -302,14 +288,8 @@ def test_what_made_nothing_better_keeps_the_weights_it_began_with(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_signal_says_what_is_kept_and_the_same_command_goes_on(
-    finetune: Finetune,
-    eight_steps: tuple[Path, str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    number: signal.Signals,
-) -> None:
-    def stopped(self: ProgressBar, state: TrainState, losses: dict[str, float]) -> None:
+def test_signal_says_what_is_kept_and_the_same_command_goes_on(finetune, eight_steps, tmp_path, monkeypatch, number):
+    def stopped(self, state, losses):
         if state.step == 5:
             signal.raise_signal(number)
 
@@ -326,7 +306,7 @@ def test_signal_says_what_is_kept_and_the_same_command_goes_on(
         assert (whole / name).read_bytes() == (resumed / name).read_bytes(), name
 
 
-def test_hooks_of_the_command_line_take_part(finetune: Finetune, tmp_path: Path) -> None:
+def test_hooks_of_the_command_line_take_part(finetune, tmp_path):
     hooks = tmp_path / "hooks_of_a_user.py"
     hooks.write_text(
         "from edgeslam_torch.train import Hooks\n"

@@ -5,7 +5,6 @@ import json
 import logging
 import shutil
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -15,23 +14,23 @@ from edgeslam_torch.commands.training import finetune as command
 from edgeslam_torch.commands.training._inputs import EXIT_INTERRUPTED
 from edgeslam_torch.errors import OutputError, SourceError
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
-from edgeslam_torch.models.fastdepth import FastDepth, Widths
+from edgeslam_torch.models.fastdepth import Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.recipes.finetune import Data
 from edgeslam_torch.train.teachers import teach as teacher
 from edgeslam_torch.train.views import posed, slam_runs
-from edgeslam_torch.train.views.posed import PosedSequence, load_run
+from edgeslam_torch.train.views.posed import load_run
 from edgeslam_torch.train.views.slam_runs import ensure_run
 
 METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
 
 
-def network() -> FastDepth:
+def network():
     torch.manual_seed(0)
     return build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
 
 
-def arguments(tmp_path: Path, *words: object) -> argparse.Namespace:
+def arguments(tmp_path, *words):
     if not (tmp_path / "start.safetensors").exists():
         save_checkpoint(network(), METADATA, tmp_path / "start.safetensors")
     parser = argparse.ArgumentParser()
@@ -40,7 +39,7 @@ def arguments(tmp_path: Path, *words: object) -> argparse.Namespace:
     return parser.parse_args([str(w) for w in (*fixed, *words)])
 
 
-def changed(run_folder: Path, tmp_path: Path) -> Path:
+def changed(run_folder, tmp_path):
     """A copy of the run that a test may change."""
     shutil.copytree(run_folder.parent / "recording", tmp_path / "recording")
     folder = shutil.copytree(run_folder, tmp_path / "run")
@@ -51,9 +50,7 @@ def changed(run_folder: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_run_is_learnt_from_and_validated_on_what_the_teacher_measured(
-    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_is_learnt_from_and_validated_on_what_the_teacher_measured(run_folder, tmp_path, capsys):
     assert command.main(arguments(tmp_path, run_folder, "--from-runs", "both")) == 0
     printed = capsys.readouterr().out
     assert "11 posed images" in printed
@@ -63,9 +60,7 @@ def test_run_is_learnt_from_and_validated_on_what_the_teacher_measured(
     assert list((tmp_path / "out" / "tensorboard").iterdir())
 
 
-def test_run_that_tracked_nothing_is_left_out_beside_others_and_refused_alone(
-    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_run_that_tracked_nothing_is_left_out_beside_others_and_refused_alone(run_folder, tmp_path, capsys, caplog):
     lost = changed(run_folder, tmp_path)
     (lost / "status.csv").write_text((lost / "status.csv").read_text().replace("tracked", "lost"))
     with caplog.at_level(logging.WARNING):
@@ -76,9 +71,7 @@ def test_run_that_tracked_nothing_is_left_out_beside_others_and_refused_alone(
         command.main(arguments(tmp_path, lost, "--overwrite"))
 
 
-def test_folder_of_a_batch_stands_for_its_finished_flights(
-    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_folder_of_a_batch_stands_for_its_finished_flights(run_folder, tmp_path, capsys):
     batch = tmp_path / "batch"
     (batch / "flights").mkdir(parents=True)
     (batch / "batch.json").write_text("{}")
@@ -98,9 +91,7 @@ def test_folder_of_a_batch_stands_for_its_finished_flights(
         assert "11 posed images" in capsys.readouterr().out
 
 
-def test_pairs_alone_leave_nothing_to_validate_on_and_that_is_said(
-    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pairs_alone_leave_nothing_to_validate_on_and_that_is_said(run_folder, tmp_path, capsys):
     assert command.main(arguments(tmp_path, run_folder, "--from-runs", "pairs")) == 0
     assert "weights after 3 steps, not validated" in capsys.readouterr().out
     metadata = load_checkpoint(tmp_path / "out" / "weights.safetensors")[1]
@@ -109,13 +100,11 @@ def test_pairs_alone_leave_nothing_to_validate_on_and_that_is_said(
 
 
 @pytest.mark.slow
-def test_interrupted_teacher_goes_on_where_it_was(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    swept: list[int] = []
+def test_interrupted_teacher_goes_on_where_it_was(run_folder, tmp_path, monkeypatch, capsys):
+    swept = []
     real = teacher._sweep
 
-    def sweep(sequence: PosedSequence, i: int) -> object:
+    def sweep(sequence, i):
         if len(swept) == 5:
             swept.append(-1)
             raise KeyboardInterrupt
@@ -134,9 +123,7 @@ def test_interrupted_teacher_goes_on_where_it_was(
 
 
 @pytest.mark.slow
-def test_depth_in_the_cache_is_measured_once_for_two_trainings(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_depth_in_the_cache_is_measured_once_for_two_trainings(run_folder, tmp_path, monkeypatch):
     cached = ("--cache", tmp_path / "cache")
     assert command.main(arguments(tmp_path, run_folder, *cached)) == 0
     assert not (tmp_path / "out" / "teacher").exists()
@@ -153,10 +140,8 @@ def test_depth_in_the_cache_is_measured_once_for_two_trainings(
 
 
 @pytest.mark.slow
-def test_teacher_of_other_weights_is_made_anew(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: object) -> None:
+def test_teacher_of_other_weights_is_made_anew(run_folder, tmp_path, monkeypatch):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
@@ -171,9 +156,7 @@ def test_teacher_of_other_weights_is_made_anew(
     assert stale.stat().st_size > 1000
 
 
-def test_run_without_a_useful_pair_is_named_and_gives_no_name(
-    run_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_run_without_a_useful_pair_is_named_and_gives_no_name(run_folder, tmp_path, caplog):
     sequence = load_run(run_folder)
     still = replace(sequence, name="hovering", partners=[()] * len(sequence.views))
     with pytest.raises(SourceError, match="no run with two images of one place with a baseline"):
@@ -184,7 +167,7 @@ def test_run_without_a_useful_pair_is_named_and_gives_no_name(
     assert "hovering: no two images" in caplog.text
 
 
-def test_largest_of_several_pieces_is_taken(run_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_largest_of_several_pieces_is_taken(run_folder, tmp_path, caplog):
     folder = changed(run_folder, tmp_path)
     rows = [line.split(",") for line in (folder / "status.csv").read_text().splitlines()[1:]]
     lines = ["stamp_s,status,piece,supported"]
@@ -195,7 +178,7 @@ def test_largest_of_several_pieces_is_taken(run_folder: Path, tmp_path: Path, ca
     assert "2 pieces whose relation is not known; learning from the largest, 9 of 12 frames" in caplog.text
 
 
-def test_first_frames_alone_are_used_when_asked(run_folder: Path) -> None:
+def test_first_frames_alone_are_used_when_asked(run_folder):
     assert len(load_run(run_folder, max_frames=10).views) == 9, "one of the ten is lost"
 
 
@@ -211,14 +194,14 @@ def test_first_frames_alone_are_used_when_asked(run_folder: Path) -> None:
         ("anchors.ply", "no ply"),
     ],
 )
-def test_damaged_run_is_named(run_folder: Path, tmp_path: Path, name: str, content: str) -> None:
+def test_damaged_run_is_named(run_folder, tmp_path, name, content):
     folder = changed(run_folder, tmp_path)
     (folder / name).write_text(content)
     with pytest.raises(SourceError, match=f"{folder}"):
         load_run(folder)
 
 
-def test_two_recordings_with_one_name_get_a_run_each(tmp_path: Path) -> None:
+def test_two_recordings_with_one_name_get_a_run_each(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name / "flight").mkdir(parents=True)
     given = arguments(tmp_path, tmp_path / "a" / "flight", tmp_path / "b" / "flight")
@@ -229,11 +212,11 @@ def test_two_recordings_with_one_name_get_a_run_each(tmp_path: Path) -> None:
 class _FakeSlam:
     """Stub of `run`: writes a minimal run folder and counts calls."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.calls = 0
         self.result = SimpleNamespace(interrupted=False, failure=None)
 
-    def __call__(self, source: object, out: Path, *_: object, **__: object) -> SimpleNamespace:
+    def __call__(self, source, out, *_, **__):
         self.calls += 1
         out.mkdir(parents=True, exist_ok=True)
         for name in ("summary.json", "trajectory.txt"):
@@ -242,20 +225,18 @@ class _FakeSlam:
 
 
 @pytest.fixture
-def slam(monkeypatch: pytest.MonkeyPatch) -> _FakeSlam:
+def slam(monkeypatch):
     fake = _FakeSlam()
     monkeypatch.setattr(slam_runs, "run", fake)
     return fake
 
 
-def test_slam_runs_once_for_the_same_recording_and_again_for_another(
-    run_folder: Path, tmp_path: Path, slam: _FakeSlam
-) -> None:
+def test_slam_runs_once_for_the_same_recording_and_again_for_another(run_folder, tmp_path, slam):
     recording = shutil.copytree(run_folder.parent / "recording", tmp_path / "flight")
     out = tmp_path / "flight" / "tuned" / "slam" / "flight"
 
-    def ensure(**more: object) -> int:
-        ensure_run(recording, out, apart=tmp_path / "flight" / "tuned", **more)  # type: ignore[arg-type]
+    def ensure(**more):
+        ensure_run(recording, out, apart=tmp_path / "flight" / "tuned", **more)
         return slam.calls
 
     assert [ensure(), ensure()] == [1, 1]
@@ -268,7 +249,7 @@ def test_slam_runs_once_for_the_same_recording_and_again_for_another(
     assert ensure() == 5
 
 
-def test_interrupted_and_failed_slam_is_not_taken_for_a_run(run_folder: Path, tmp_path: Path, slam: _FakeSlam) -> None:
+def test_interrupted_and_failed_slam_is_not_taken_for_a_run(run_folder, tmp_path, slam):
     recording, out = run_folder.parent / "recording", tmp_path / "slam" / "flight"
     slam.result.interrupted = True
     with pytest.raises(KeyboardInterrupt):

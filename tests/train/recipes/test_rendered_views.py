@@ -1,7 +1,5 @@
 """Rendered places to learn from."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -15,7 +13,7 @@ def corridor():
     return place("long_blank_corridor", np.random.default_rng(0), long=8.0, wide=3.0)
 
 
-def test_oblique_poses_stand_near_a_wall_and_look_along_or_into_it(corridor) -> None:
+def test_oblique_poses_stand_near_a_wall_and_look_along_or_into_it(corridor):
     rng = np.random.default_rng(1)
     low, high = corridor.bounds_w
     for _ in range(30):
@@ -32,7 +30,7 @@ def test_oblique_poses_stand_near_a_wall_and_look_along_or_into_it(corridor) -> 
         np.testing.assert_allclose(T_w_c[:3, :3] @ T_w_c[:3, :3].T, np.eye(3), atol=1e-9)
 
 
-def test_near_poses_look_at_what_stands_beside_them(corridor) -> None:
+def test_near_poses_look_at_what_stands_beside_them(corridor):
     """In a corridor without furniture the nearest wall is .3 to 1.25 m away, and mostly in view."""
     rng = np.random.default_rng(2)
     low, high = corridor.bounds_w
@@ -49,7 +47,7 @@ def test_near_poses_look_at_what_stands_beside_them(corridor) -> None:
 
 
 @pytest.mark.slow
-def test_a_place_depends_on_its_number_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_place_depends_on_its_number_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(rendered_views, "LEVEL_VIEWS", 1)
     monkeypatch.setattr(rendered_views, "OBLIQUE_VIEWS", 1)
     monkeypatch.setattr(rendered_views, "NEAR_VIEWS", 1)
@@ -66,7 +64,7 @@ def test_a_place_depends_on_its_number_alone(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.slow
-def test_files_that_are_there_stay(tmp_path: Path) -> None:
+def test_files_that_are_there_stay(tmp_path):
     kept = tmp_path / "places_00000.npz"
     kept.write_bytes(b"kept")
     rendered_views.render_files(tmp_path, rendered_views.PLACES_A_FILE)

@@ -10,7 +10,7 @@ from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.recipes.weights import mean_of
 
 
-def test_the_mean_lies_between_and_is_of_one_network() -> None:
+def test_the_mean_lies_between_and_is_of_one_network():
     metadata = Metadata(input_height=32, input_width=64, focal_px=60.0)
     small, other = Widths((4,) + (8,) * 13, (8,) * 5), Widths((4,) + (8,) * 13, (8,) * 4 + (4,))
     torch.manual_seed(0)

@@ -6,14 +6,14 @@ import pytest
 from edgeslam_torch.train.teachers.densify import densify
 
 
-def scene() -> tuple[np.ndarray, np.ndarray]:
+def scene():
     """Log depth of a tilted wall, and a network's view of it: 30 % too far on the left, right on the right."""
     true = np.log(np.linspace(1.5, 3.0, 160, dtype=np.float32))[None].repeat(120, 0)
     wrong = true + np.linspace(0.3, 0.0, 160, dtype=np.float32)[None]
     return true, wrong
 
 
-def test_points_correct_the_network_smoothly(rng: np.random.Generator) -> None:
+def test_points_correct_the_network_smoothly(rng):
     true, wrong = scene()
     uv = np.stack([rng.uniform(0, 159, 600), rng.uniform(0, 119, 600)], 1)
     log_z = true[np.rint(uv[:, 1]).astype(int), np.rint(uv[:, 0]).astype(int)]
@@ -22,7 +22,7 @@ def test_points_correct_the_network_smoothly(rng: np.random.Generator) -> None:
     assert np.abs(np.diff(out - wrong, axis=1)).max() < 0.02, "no steps at the points"
 
 
-def test_one_outlier_changes_little(rng: np.random.Generator) -> None:
+def test_one_outlier_changes_little(rng):
     true, _ = scene()
     uv = np.stack([rng.uniform(0, 159, 300), rng.uniform(0, 119, 300)], 1)
     log_z = true[np.rint(uv[:, 1]).astype(int), np.rint(uv[:, 0]).astype(int)].copy()
@@ -30,7 +30,7 @@ def test_one_outlier_changes_little(rng: np.random.Generator) -> None:
     assert np.abs(densify(true, uv, log_z) - true).max() < 0.02
 
 
-def test_far_from_points_the_median_ratio_is_used() -> None:
+def test_far_from_points_the_median_ratio_is_used():
     wrong = np.zeros((120, 160), np.float32)
     uv = np.stack([np.linspace(5, 20, 40), np.linspace(5, 20, 40)], 1)
     out = densify(wrong, uv, np.full(40, 0.25))

@@ -12,25 +12,25 @@ NORMAL, DISTANCE = np.array([0.3, 0.1, -1.0]), -2.0
 INVERSE = np.linspace(1 / 4.0, 1 / 1.0, 40)
 
 
-def texture(rng: np.random.Generator) -> np.ndarray:
+def texture(rng):
     """Blobs of a few pixels, grey levels 0 to 255."""
     noise = cv2.GaussianBlur(rng.normal(size=(90, 120)).astype(np.float32), (0, 0), 1.5)
     return np.asarray(cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX), np.float32)
 
 
-def seen_from(reference: np.ndarray, T: np.ndarray) -> np.ndarray:
+def seen_from(reference, T):
     """The wall's picture in a camera at ``T`` (reference to camera): an exact homography."""
     H = K @ (T[:3, :3] + np.outer(T[:3, 3], NORMAL) / DISTANCE) @ np.linalg.inv(K)
     return np.asarray(cv2.warpPerspective(reference, H, (120, 90), borderValue=0), np.float32)
 
 
-def wall_depth() -> np.ndarray:
+def wall_depth():
     u, v = np.meshgrid(np.arange(120), np.arange(90))
     rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
     return DISTANCE / (rays @ NORMAL)
 
 
-def moved(*t: float) -> np.ndarray:
+def moved(*t):
     T = np.eye(4)
     T[:3, 3] = t
     T[:3, :3], _ = cv2.Rodrigues(np.array([0.01, -0.02, 0.015]))
@@ -42,7 +42,7 @@ def moved(*t: float) -> np.ndarray:
     [[(0.15, 0, 0), (-0.15, 0, 0), (0.2, 0.05, 0)], [(0, 0, -0.35), (0, 0, 0.35), (0.02, 0, -0.5)]],
     ids=["sideways", "forward"],
 )
-def test_slanted_wall_is_measured(places: list[tuple[float, float, float]], rng: np.random.Generator) -> None:
+def test_slanted_wall_is_measured(places, rng):
     reference = texture(rng)
     motions = [moved(*p) for p in places]
     depth = sweep_depth(reference, [seen_from(reference, T) for T in motions], motions, K, INVERSE)
@@ -54,7 +54,7 @@ def test_slanted_wall_is_measured(places: list[tuple[float, float, float]], rng:
     assert np.mean(error[inside] < 0.06) > 0.9
 
 
-def test_what_one_neighbour_does_not_see_is_taken_from_the_others(rng: np.random.Generator) -> None:
+def test_what_one_neighbour_does_not_see_is_taken_from_the_others(rng):
     reference = texture(rng)
     motions = [moved(0.15, 0, 0), moved(-0.15, 0, 0), moved(0.1, 0.1, 0), moved(-0.1, 0.1, 0)]
     images = [seen_from(reference, T) for T in motions]
@@ -63,7 +63,7 @@ def test_what_one_neighbour_does_not_see_is_taken_from_the_others(rng: np.random
     assert np.mean((np.abs(depth / wall_depth() - 1) < 0.06)[12:78, 15:105]) > 0.85
 
 
-def test_bare_pixels_follow_their_neighbours() -> None:
+def test_bare_pixels_follow_their_neighbours():
     """Uninformative costs take the plane of their surroundings; informative ones keep their minimum."""
     cost = np.full((8, 20, 20), 1.0, np.float32)
     cost[3] = 0.2

@@ -13,7 +13,7 @@ from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.train.views.datasets import has_depth, load_depth_folder
 
 
-def test_depth_is_metres_and_holes_are_zero(tmp_path: Path) -> None:
+def test_depth_is_metres_and_holes_are_zero(tmp_path):
     folder = load_depth_folder(write_folder(tmp_path / "a"))
     assert len(folder.views) == 12
     depth = folder.views[0].depth_m
@@ -22,20 +22,20 @@ def test_depth_is_metres_and_holes_are_zero(tmp_path: Path) -> None:
     assert len(load_depth_folder(tmp_path / "a", stride=3, max_frames=9).views) == 3
 
 
-def test_reduced_image_has_reduced_intrinsics(tmp_path: Path) -> None:
+def test_reduced_image_has_reduced_intrinsics(tmp_path):
     view = load_depth_folder(write_folder(tmp_path / "a", 1), width=32).views[0]
     assert view.image.shape == (24, 32, 3)
     np.testing.assert_allclose(view.K, CAMERA.scaled(32, 24).K)
 
 
-def test_distorted_lens_is_straightened_without_mixing_depths(tmp_path: Path) -> None:
+def test_distorted_lens_is_straightened_without_mixing_depths(tmp_path):
     bent = replace(CAMERA, distortion=(0.3, 0.0, 0.0, 0.0, 0.0))
     depth = load_depth_folder(write_folder(tmp_path / "a", 1, bent)).views[0].depth_m
     levels = np.round(np.linspace(1000, 3000, 64)) / 1000
     assert np.abs(depth[depth > 0][:, None] - levels).min(1).max() < 2e-3
 
 
-def test_unreadable_files_are_listed_and_the_rest_is_used(tmp_path: Path) -> None:
+def test_unreadable_files_are_listed_and_the_rest_is_used(tmp_path):
     folder = write_folder(tmp_path / "a")
     (folder / "rgb" / "3.png").write_bytes(b"broken")
     (folder / "depth" / "5.png").unlink()
@@ -47,7 +47,7 @@ def test_unreadable_files_are_listed_and_the_rest_is_used(tmp_path: Path) -> Non
     ]
 
 
-def test_recording_with_depth_is_told_from_one_without(tmp_path: Path) -> None:
+def test_recording_with_depth_is_told_from_one_without(tmp_path):
     folder = write_folder(tmp_path / "a", 1)
     assert has_depth(folder)
     assert not has_depth(tmp_path) and not has_depth(tmp_path / "none")
@@ -60,7 +60,7 @@ def test_recording_with_depth_is_told_from_one_without(tmp_path: Path) -> None:
         load_depth_folder(folder)
 
 
-def test_line_that_is_none_is_left_out_by_name(tmp_path: Path) -> None:
+def test_line_that_is_none_is_left_out_by_name(tmp_path):
     folder = write_folder(tmp_path / "a", 2)
     with (folder / "depth.txt").open("a") as file:
         file.write("not a list\n")
@@ -71,7 +71,7 @@ def test_line_that_is_none_is_left_out_by_name(tmp_path: Path) -> None:
         load_depth_folder(folder)
 
 
-def test_unstated_unit_is_tums_with_a_remark(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_unstated_unit_is_tums_with_a_remark(tmp_path, caplog):
     folder = write_folder(tmp_path / "a", 1)
     save_camera(folder / "camera.yaml", CAMERA)
     depth = load_depth_folder(folder).views[0].depth_m
@@ -79,7 +79,7 @@ def test_unstated_unit_is_tums_with_a_remark(tmp_path: Path, caplog: pytest.LogC
     assert "does not say the unit of its depth maps" in caplog.text
 
 
-def test_maps_of_another_camera_are_turned_to_the_colour_camera(tmp_path: Path) -> None:
+def test_maps_of_another_camera_are_turned_to_the_colour_camera(tmp_path):
     folder = tmp_path / "seq-01"
     folder.mkdir()
     image = np.zeros((480, 640, 3), np.uint8)
@@ -92,7 +92,7 @@ def test_maps_of_another_camera_are_turned_to_the_colour_camera(tmp_path: Path) 
     assert np.median(view.depth_m[view.depth_m > 0]) == pytest.approx(2.0, abs=0.02)
 
 
-def test_images_of_another_size_and_maps_without_depth_are_left_out(tmp_path: Path) -> None:
+def test_images_of_another_size_and_maps_without_depth_are_left_out(tmp_path):
     folder = write_folder(tmp_path / "a")
     cv2.imwrite(str(folder / "rgb" / "2.png"), np.zeros((24, 32, 3), np.uint8))
     cv2.imwrite(str(folder / "depth" / "7.png"), np.zeros((48, 64), np.uint16))
@@ -102,7 +102,7 @@ def test_images_of_another_size_and_maps_without_depth_are_left_out(tmp_path: Pa
     assert "depth/7.png: no depth between 0.05 and 30 m" in loaded.left_out[1]
 
 
-def test_folder_of_nothing_but_holes_is_refused(tmp_path: Path) -> None:
+def test_folder_of_nothing_but_holes_is_refused(tmp_path):
     folder = write_folder(tmp_path / "a", 3)
     for path in (folder / "depth").iterdir():
         cv2.imwrite(str(path), np.zeros((48, 64), np.uint16))
@@ -110,7 +110,7 @@ def test_folder_of_nothing_but_holes_is_refused(tmp_path: Path) -> None:
         load_depth_folder(folder)
 
 
-def test_stamps_that_match_nothing_are_said(tmp_path: Path) -> None:
+def test_stamps_that_match_nothing_are_said(tmp_path):
     folder = write_folder(tmp_path / "a", 3)
     (folder / "rgb.txt").write_text("5.0 rgb/0.png\n")
     with pytest.raises(SourceError, match="no image within 0.02 s of a depth map"):
@@ -121,7 +121,7 @@ def test_stamps_that_match_nothing_are_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stamp", ["nan", "inf", "later"])
-def test_stamp_that_is_no_number_is_left_out(tmp_path: Path, stamp: str) -> None:
+def test_stamp_that_is_no_number_is_left_out(tmp_path, stamp):
     folder = write_folder(tmp_path / "a", 3)
     with (folder / "rgb.txt").open("a") as file:
         file.write(f"{stamp} rgb/0.png\n")
@@ -130,7 +130,7 @@ def test_stamp_that_is_no_number_is_left_out(tmp_path: Path, stamp: str) -> None
 
 
 @pytest.mark.parametrize("scale", ["0", "-1", "five", ".nan", "[1]"])
-def test_absurd_depth_scale_is_refused(tmp_path: Path, scale: str) -> None:
+def test_absurd_depth_scale_is_refused(tmp_path, scale):
     folder = write_folder(tmp_path / "a", 3)
     text = (folder / "camera.yaml").read_text().replace("depth_scale: 1000.0", f"depth_scale: {scale}")
     (folder / "camera.yaml").write_text(text)
@@ -139,7 +139,7 @@ def test_absurd_depth_scale_is_refused(tmp_path: Path, scale: str) -> None:
 
 
 @pytest.mark.parametrize("key", ["DepthMapFactor", "RGBD.DepthMapFactor"])
-def test_unit_of_depth_in_the_words_of_orb_slam(tmp_path: Path, key: str) -> None:
+def test_unit_of_depth_in_the_words_of_orb_slam(tmp_path, key):
     folder = write_folder(tmp_path / "a", 3)
     text = (folder / "camera.yaml").read_text().replace("depth_scale: 1000.0", f"{key}: 1000.0")
     (folder / "camera.yaml").write_text("%YAML:1.0\n" + text)

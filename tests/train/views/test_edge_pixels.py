@@ -7,7 +7,7 @@ from edgeslam_torch.frontend.canny import canny_batch
 from edgeslam_torch.train.views.edge_pixels import edge_pixels
 
 
-def squares() -> torch.Tensor:
+def squares():
     images = torch.full((3, 3, 40, 48), 0.2)
     images[0, :, 10:30, 12:36] = 0.9
     images[1, :, 5:9, 40:44] = 0.9

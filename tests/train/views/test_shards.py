@@ -4,7 +4,6 @@ import gzip
 import io
 import json
 import tarfile
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,13 +19,13 @@ from edgeslam_torch.train.views.shards import is_sharded, load_shards, write_sha
 K = np.array([[40.0, 0.0, 15.5], [0.0, 41.0, 11.5], [0.0, 0.0, 1.0]])
 
 
-def views(count: int) -> list[View]:
+def views(count):
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (count, 24, 32, 3), np.uint8)
     return [View(image, np.full((24, 32), 1.0 + 0.25 * i, np.float32), K) for i, image in enumerate(images)]
 
 
-def tar(path: Path, files: dict[str, bytes]) -> Path:
+def tar(path, files):
     with tarfile.open(path, "w") as out:
         for name, content in files.items():
             entry = tarfile.TarInfo(name)
@@ -35,7 +34,7 @@ def tar(path: Path, files: dict[str, bytes]) -> Path:
     return path
 
 
-def sample(name: str = "a", **other: bytes) -> dict[str, bytes]:
+def sample(name="a", **other):
     image = cv2.imencode(".jpg", np.full((24, 32, 3), 90, np.uint8))[1].tobytes()
     depth = io.BytesIO()
     np.save(depth, np.full((24, 32), 2.5))
@@ -46,7 +45,7 @@ def sample(name: str = "a", **other: bytes) -> dict[str, bytes]:
     }
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_what_is_written_is_read(tmp_path):
     given = views(7)
     written = write_shards(given, tmp_path, "flight", per_shard=3)
     assert [path.name for path in written] == ["flight-000000.tar", "flight-000003.tar", "flight-000006.tar"]
@@ -63,7 +62,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert load_shards(tmp_path, width=16).views[0].K[0, 0] == pytest.approx(20.0)
 
 
-def test_files_of_others_in_metres_and_in_their_own_unit(tmp_path: Path) -> None:
+def test_files_of_others_in_metres_and_in_their_own_unit(tmp_path):
     stored = cv2.imencode(".png", np.full((24, 32), 5000, np.uint16))[1].tobytes()
     camera = json.dumps({"fx": 40, "fy": 41, "cx": 15, "cy": 11, "depth_per_m": 5000}).encode()
     files = {**sample("x/a"), **sample("x/b.", depth_png=stored, json=camera), "README": b"not a sample"}
@@ -86,7 +85,7 @@ def test_files_of_others_in_metres_and_in_their_own_unit(tmp_path: Path) -> None
         ({"depth_png": cv2.imencode(".png", np.zeros((24, 32), np.uint8))[1].tobytes()}, "no 16-bit image"),
     ],
 )
-def test_damaged_sample_is_named_when_it_is_drawn(tmp_path: Path, other: dict[str, bytes], why: str) -> None:
+def test_damaged_sample_is_named_when_it_is_drawn(tmp_path, other, why):
     folder = load_shards(tar(tmp_path / "bad.tar", {**sample("good"), **sample("bad", **other)}))
     assert folder.views[0].depth_m.max() == 2.5
     with pytest.raises(
@@ -95,7 +94,7 @@ def test_damaged_sample_is_named_when_it_is_drawn(tmp_path: Path, other: dict[st
         folder.views[1]
 
 
-def test_shards_that_are_none_are_named(tmp_path: Path) -> None:
+def test_shards_that_are_none_are_named(tmp_path):
     whole = tar(tmp_path / "whole.tar", sample()).read_bytes()
     cases = {
         "packed.tar": (gzip.compress(whole), "compressed ones: gunzip"),
@@ -110,7 +109,7 @@ def test_shards_that_are_none_are_named(tmp_path: Path) -> None:
         load_shards(tar(tmp_path / "half.tar", {k: v for k, v in sample().items() if "depth" not in k}))
 
 
-def test_record_changes_with_the_content_and_reads_no_sample(tmp_path: Path) -> None:
+def test_record_changes_with_the_content_and_reads_no_sample(tmp_path):
     write_shards(views(3), tmp_path, "flight")
     first = labelled_set(load_shards(tmp_path))
     assert first.images == 3
@@ -130,7 +129,7 @@ class _Counted(list[View]):
 
 
 @pytest.mark.parametrize("count", [2, 9, 10, 11, 25, HELD_OUT * MOST_HELD_OUT + 5])
-def test_views_are_divided_without_reading_those_to_learn_from(count: int) -> None:
+def test_views_are_divided_without_reading_those_to_learn_from(count):
     marked = [View(np.zeros((1, 1, 3), np.uint8), np.full((1, 1), i, np.float32), K) for i in range(count)]
     counted = _Counted(marked)
     (source,), held_out = _split([DepthFolder("a", counted, ())], keep_all=False)
