@@ -3,7 +3,7 @@
 A figure is added by a function in `METRICS`, and a line in the columns of `edgeslam_torch.eval.judge.table`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -154,14 +154,6 @@ def _beginning(judged: Judged) -> dict[str, Any]:
     return {"first_m": begin, "first_over_rest": begin / rest if rest > 0 else None}
 
 
-def _live_scale(judged: Judged) -> dict[str, Any]:
-    return dict(live_figures(judged.run, judged.poses))
-
-
-def _returns(judged: Judged) -> dict[str, Any]:
-    return dict(returns(judged.poses, judged.run.trajectory, judged.run.online))
-
-
 def _map(judged: Judged) -> dict[str, Any]:
     found, surfaces, cloud = judged.score.map, judged.truth.surfaces, judged.run.cloud()
     if found is not None:
@@ -181,12 +173,12 @@ def _map(judged: Judged) -> dict[str, Any]:
     return {"map_median_m": np.median(distance), **within, "map_judged": 1.0}
 
 
-METRICS: tuple[Callable[[Judged], dict[str, Any]], ...] = (
+METRICS: tuple[Callable[[Judged], Mapping[str, Any]], ...] = (
     _trajectory,
     _scale,
     _beginning,
-    _live_scale,
-    _returns,
+    lambda judged: live_figures(judged.run, judged.poses),
+    lambda judged: returns(judged.poses, judged.run.trajectory, judged.run.online),
     _map,
 )
 """Figures of a run with ground truth."""

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import binomtest
 
 from edgeslam_torch.eval.experiment.conditions import code_state
 from edgeslam_torch.eval.experiment.runner import Local, Task, run_tasks
@@ -21,7 +22,6 @@ FAILED = "failed"
 _WORST = 6
 """Number of worst flights with a top view and a film strip."""
 _TIMEOUT_S = 3600.0
-_Z = 1.959964
 HEAD = (
     "world", "behaviour", "fault", "perception", "flights", "reached", "contact", "no contact and landed on the floor",
     "clearance p5, min [m]", "time over oracle", "cruise [m/s]", "CPU a tick, worst [ms]",
@@ -90,23 +90,9 @@ def _line(flown: Flown) -> str:
     )
 
 
-def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """95 % interval of a share (Wilson 1927).
-
-    Example:
-        >>> [round(x, 3) for x in wilson(20, 20)], [round(x, 3) for x in wilson(10, 20)]
-        ([0.839, 1.0], [0.299, 0.701])
-    """
-    if trials == 0:
-        return 0.0, 1.0
-    share, z2 = successes / trials, _Z * _Z
-    middle = (share + z2 / (2 * trials)) / (1 + z2 / trials)
-    half = _Z * math.sqrt(share * (1 - share) / trials + z2 / (4 * trials**2)) / (1 + z2 / trials)
-    return max(0.0, middle - half), min(1.0, middle + half)
-
-
 def _share(successes: int, trials: int) -> str:
-    low, high = wilson(successes, trials)
+    """Number and 95 % interval of its share (Wilson 1927)."""
+    low, high = binomtest(successes, trials).proportion_ci(method="wilson") if trials else (0.0, 1.0)
     return f"{successes} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
