@@ -28,7 +28,8 @@ COMMANDS = {
     "run": "edgeslam run recordings/tum_fr1_xyz --out runs/fr1",
     "fly": "edgeslam fly goto 3 0 --drone sim://l_corridor:3 --fly",
     "finetune": "edgeslam finetune recordings/7scenes_redkitchen --steps 40 --out tuned",
-    "export": "edgeslam export tuned/weights.safetensors --out model.onnx --int8 --calibrate recordings/tum_fr1_rpy_depth",
+    "export": "edgeslam export tuned/weights.safetensors --out model.onnx --int8 "
+    "--calibrate recordings/tum_fr1_rpy_depth",
 }
 """Commands whose output the documents show, in this order: later ones use what earlier ones wrote."""
 
