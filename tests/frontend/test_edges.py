@@ -60,8 +60,8 @@ def test_edges_of_a_dark_room_are_those_of_the_lit_one(exposure, found, right):
     grey = in_the_dark(grey, 130.0 / np.percentile(grey, 95), 1.5)  # just well exposed
     lit = extract_edges(grey, 40.0, 100.0, 10**6).uv.astype(int)
     dark = extract_edges(in_the_dark(grey, exposure, 1.5), 40.0, 100.0, 10**6).uv.astype(int)
-    assert np.mean([near(dark, grey.shape)[v, u] for u, v in lit]) >= found
-    assert np.mean([near(lit, grey.shape)[v, u] for u, v in dark]) >= right
+    for these, those, share in ((lit, dark, found), (dark, lit, right)):
+        assert near(those, grey.shape)[these[:, 1], these[:, 0]].mean() >= share
 
 
 def near(uv, shape):
