@@ -14,9 +14,10 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "docs" / "results"
-PAGES = (ROOT / "README.md", *sorted(RESULTS.glob("*.md")))
 PEERS = ROOT / "eval" / "benchmark" / "peers.toml"
 BLOCK = re.compile(r"<!-- results: (\w+) -->(.*?)<!-- end -->", re.DOTALL)
+_DOCUMENTS = (ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md")))
+PAGES = tuple(page for page in _DOCUMENTS if BLOCK.search(page.read_text(encoding="utf-8")))
 
 RECORDINGS = {
     "tum_fr1_xyz": "TUM fr1_xyz, desk",
@@ -29,7 +30,7 @@ RECORDINGS = {
 }
 """Runs of the release that are recordings, and their titles."""
 FLIGHTS = {"flight/room": "room", "flight/corridor": "corridor", "flight/block": "once around a block"}
-SHOWN = {"fly": 2}
+SHOWN = {"fly": 3, "evaluate": 99, "plan": 99}
 """Lines at the end of a command's output that documents show; 5 of others."""
 Figures = dict[str, list[float]]
 

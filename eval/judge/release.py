@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -26,10 +27,15 @@ RUNS: dict[str, int] = CASES["release"]
 COMMANDS = {
     "demo": "edgeslam demo --out runs/demo",
     "run": "edgeslam run recordings/tum_fr1_xyz --out runs/fr1",
-    "fly": "edgeslam fly goto 3 0 --drone sim://l_corridor:3 --fly",
+    "evaluate": "edgeslam eval runs/fr1 -g recordings/tum_fr1_xyz",
+    "occupancy": "edgeslam export-map runs/demo --format occupancy --out grid",
+    "plan": "edgeslam fly goto 3 0 --drone sim://l_corridor:3",
+    "fly": "edgeslam fly goto 3 0 --drone sim://l_corridor:3 --fly --record flights/1",
+    "replay": "edgeslam fly replay flights/1",
     "finetune": "edgeslam finetune recordings/7scenes_redkitchen --steps 40 --out tuned",
-    "export": "edgeslam export tuned/weights.safetensors --out model.onnx --int8 "
-    "--calibrate recordings/tum_fr1_rpy_depth",
+    "export": "edgeslam export tuned/weights.safetensors --out model.onnx --int8 --calibrate recordings/tum_fr1_rpy_depth",
+    "fleet": "edgeslam demo --record-only --flights 3 --world corridor --duration 2 --rate 15 --width 320 --out fleet",
+    "batch": "edgeslam batch fleet --out batch",
 }
 """Commands whose output the documents show, in this order: later ones use what earlier ones wrote."""
 
@@ -121,20 +127,20 @@ def command_outputs(data: Path, out: Path, commit: str, say: Callable[[str], Non
         EvaluationError: If one fails.
     """
     folder = out / "commands"
+    kept = folder / "outputs.json"
+    found = read_mapping(kept, "JSON", EvaluationError) if kept.is_file() else {}
+    if found.get("key") != [commit, COMMANDS]:
+        shutil.rmtree(folder, ignore_errors=True)
+        found = {"key": [commit, COMMANDS], "lines": {}}
     recordings = folder / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
     for name, (recording, _) in find_recordings(data).items():
         if not (recordings / name).exists():
             (recordings / name).symlink_to(recording)
-    kept = folder / "outputs.json"
-    found = read_mapping(kept, "JSON", EvaluationError) if kept.is_file() else {}
-    if found.get("key") != [commit, COMMANDS]:
-        found = {"key": [commit, COMMANDS], "lines": {}}
     for name, command in COMMANDS.items():
         if name not in found["lines"]:
             say(f"$ {command}")
             words = [sys.executable, "-m", "edgeslam_torch.cli", *command.split()[1:]]
-            words += ["--overwrite"] if name in ("finetune", "export") else []  # what another commit left
             environment = os.environ | {"COLUMNS": "100"}
             done = subprocess.run(words, cwd=folder, capture_output=True, text=True, env=environment, check=False)
             if done.returncode != 0:
