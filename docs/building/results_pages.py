@@ -30,8 +30,8 @@ RECORDINGS = {
 }
 """Runs of the release that are recordings, and their titles."""
 FLIGHTS = {"flight/room": "room", "flight/corridor": "corridor", "flight/block": "once around a block"}
-SHOWN = {"fly": 3, "evaluate": 99, "plan": 99}
-"""Lines at the end of a command's output that documents show; 5 of others."""
+SHOWN = {"fly": slice(-3, None), "evaluate": slice(0, 14), "plan": slice(None)}
+"""Lines of a command's output that documents show; the last five of others."""
 Figures = dict[str, list[float]]
 
 
@@ -44,7 +44,7 @@ def newest() -> dict[str, Any]:
 def blocks(release: dict[str, Any], peers: Sequence[dict[str, Any]]) -> dict[str, str]:
     """Text of every block by its name."""
     outputs = {
-        name: _block("\n".join(["```text", command, *lines[-SHOWN.get(name, 5) :], "```"]))
+        name: _block("\n".join(["```text", command, *lines[SHOWN.get(name, slice(-5, None))], "```"]))
         for name, (command, *lines) in release["outputs"].items()
     }
     runs = release["runs"]

@@ -33,7 +33,7 @@ COMMANDS = {
     "fly": "edgeslam fly goto 3 0 --drone sim://l_corridor:3 --fly --record flights/1",
     "replay": "edgeslam fly replay flights/1",
     "finetune": "edgeslam finetune recordings/7scenes_redkitchen --steps 40 --out tuned",
-    "export": "edgeslam export tuned/weights.safetensors --out model.onnx --int8 --calibrate recordings/tum_fr1_rpy_depth",
+    "export": "edgeslam export tuned/weights.safetensors --out model.onnx --int8 --calibrate recordings/tum_fr1_xyz",
     "fleet": "edgeslam demo --record-only --flights 3 --world corridor --duration 2 --rate 15 --width 320 --out fleet",
     "batch": "edgeslam batch fleet --out batch",
 }
