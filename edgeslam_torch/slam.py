@@ -81,8 +81,8 @@ class EdgeSlam:
         camera: Intrinsics of the raw images.
         config: Settings.
         depth: Depth function instead of the configured one.
-        realtime: Map keyframes on a worker thread while tracking continues; a keyframe that would have to wait is
-            skipped and counted. Results then depend on timing.
+        realtime: Map keyframes on a worker thread while tracking continues; a keyframe that is due
+            meanwhile is skipped and counted, and the next frame waits. Results then depend on timing.
         executor: Single-thread executor instead of the one that ``realtime`` creates.
         imu: Noise, mount and clock of the IMU whose readings `step` is given; those of a cheap one when None.
 
@@ -242,7 +242,7 @@ class EdgeSlam:
             raise SourceError(f"{frame.name}: stamp {frame.stamp_s} s does not follow {self._system.motion.stamp_s} s")
         system = self._system
         system.stage_ms = {}
-        system.collect()
+        system.collect(wait=system.needs_map)
         with system.timed("joining"):
             joined = self._joining.update(frame.stamp_s)
         with system.timed("features"):

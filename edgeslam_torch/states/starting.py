@@ -123,6 +123,7 @@ class Starting:
         """A frame without a pose: predict it, or start a new submap there after a longer loss."""
         system = self.system
         system.events["lost"] += lost_since_s == np.inf
+        system.needs_map = system.mapping.busy
         self.tracking.lost.append((frame.index, view))
         system.motion.drift(T_predicted)
         system.fusion.add_visual(frame.stamp_s, se3.inverse(T_predicted), np.inf, np.inf, tracked=False)

@@ -75,6 +75,9 @@ class System:
     """Stamp of the frame with which the newest submap began."""
     keyframe_s: float = -np.inf
     """Stamp of the newest keyframe, or of a later frame that needed not become one."""
+    needs_map: bool = False
+    """Whether a keyframe was due, or the pose was not found, while real-time mapping was busy: the next frame waits for
+    its result, since a view that leaves the map faster than this grows is lost."""
     shows_nothing_new: bool = False
     """Whether the current image repeats the previous one."""
     _sensor_prior: tuple[float, SensorPrior | None] = field(default=(-np.inf, None), init=False, repr=False)
@@ -206,6 +209,7 @@ class System:
     def collect(self, wait: bool = False) -> None:
         """Collect finished results of real-time mapping; with ``wait`` the caller owns the map afterwards."""
         self.absorb(self.mapping.collect(wait))
+        self.needs_map = self.needs_map and self.mapping.busy
 
     def absorb(self, mapped: Mapped | None) -> bool:
         """Apply the refinement of the newest keyframe to the current pose."""

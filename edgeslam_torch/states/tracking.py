@@ -317,6 +317,7 @@ class Tracking:
         """Map a new keyframe; None while real-time mapping is busy with the last one."""
         system = self.system
         if system.mapping.busy or located.view is None:
+            system.needs_map = system.mapping.busy
             system.events["keyframes_skipped"] = system.events.get("keyframes_skipped", 0) + 1
             return None
         track, features = located.track, located.view.features
