@@ -17,7 +17,7 @@ def iou(a, b):
     return (a & b).sum() / (a | b).sum()
 
 
-@pytest.mark.parametrize("image", [lambda: views()[0], room_view], ids=["panels", "room"])
+@pytest.mark.parametrize("image", [lambda: views()[0], pytest.param(room_view, marks=pytest.mark.slow)])
 def test_kornia_and_opencv_mark_the_same_pixels(image):
     """They part where OpenCV's 8-bit rounding tips a pixel over a threshold: 0.938 and 0.948 when written."""
     grey = cv2.cvtColor(image(), cv2.COLOR_BGR2GRAY)

@@ -121,10 +121,6 @@ def test_missing_and_binary_files_are_refused(tmp_path):
         read_telemetry(path)
 
 
-def test_a_file_with_a_header_only_gives_no_samples(tmp_path):
-    assert read_telemetry(write(tmp_path, "stamp_s,vgx\n"))[0] == []
-
-
 def climbing(tmp_path, velocity_unit, sign):
     """A log whose drone climbs and sinks by half a metre."""
     lines = ["timestamp,vx,vy,vz,tof"]

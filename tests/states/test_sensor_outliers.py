@@ -105,7 +105,7 @@ def sensor_prediction(flight):
     return place
 
 
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_position_prevents_a_mismatch_on_a_repetitive_wall(axis):
     flight = passing(axis)
     held, alone = (flown(flight, place=place) for place in (sensor_prediction(flight), lambda stamp_s: None))

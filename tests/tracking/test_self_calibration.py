@@ -149,6 +149,7 @@ def strolling():
     return film(stairs_world(), camera, np.stack([se3.exp(xi) for xi in steps]))
 
 
+@pytest.mark.slow
 def test_rendered_flight_gives_it_within_fifteen_percent():
     """ORB's pixel of noise weighs twice at this size; the guess in its place is off by 28 %."""
     images = [f.image for f in strolling().frames]

@@ -59,6 +59,7 @@ def test_another_network_learns_from_labels_and_is_restored_from_the_best_file(t
     )
 
 
+@pytest.mark.slow
 def test_another_network_learns_from_a_run_by_the_sweep(run_folder, tmp_path):
     """Nothing but poses and map points: the network's own depth only fills what the sweep leaves open."""
     torch.manual_seed(0)

@@ -143,7 +143,7 @@ def _search(
     size = smooth.shape[2], smooth.shape[1]
     inverse_depth, sigma = np.full(len(uv), np.nan), np.full(len(uv), np.nan)
     ray, across, share = np.zeros((targets, 3)), np.zeros((targets, 2)), np.zeros(targets)
-    coarse, fine = np.zeros(4), np.zeros(5)
+    coarse, fine, lowest = np.zeros(4), np.zeros(5), np.zeros(3)
     cost = np.zeros(max(most, HYPOTHESES[0]))
     for e in range(len(uv)):
         weight, length, crossing = 0.0, 0.0, 0
@@ -191,21 +191,16 @@ def _search(
         for i in range(5):
             px = FINE_PX[i]
             fine[i] = _interpolated(grey[0], uv[e, 0] + px * normal[e, 0], uv[e, 1] + px * normal[e, 1])
-        a = _fine_cost(grey, ray, along, across, share, fine, rho - step)
-        b = _fine_cost(grey, ray, along, across, share, fine, rho)
-        c = _fine_cost(grey, ray, along, across, share, fine, rho + step)
-        if a < c:
-            for _ in range(2):
-                if b <= a:
-                    break
-                rho, b, c = rho - step, a, b
-                a = _fine_cost(grey, ray, along, across, share, fine, rho - step)
-        else:
-            for _ in range(2):
-                if b <= c:
-                    break
-                rho, a, b = rho + step, b, c
-                c = _fine_cost(grey, ray, along, across, share, fine, rho + step)
+        for k in range(3):  # one call and not three: the compiler copies what is called, which takes seconds
+            lowest[k] = _fine_cost(grey, ray, along, across, share, fine, rho + (k - 1) * step)
+        a, b, c = lowest
+        way = -1.0 if a < c else 1.0
+        for _ in range(2):
+            if b <= (a if way < 0.0 else c):
+                break
+            rho += way * step
+            beyond = _fine_cost(grey, ray, along, across, share, fine, rho + way * step)
+            a, b, c = (beyond, a, b) if way < 0.0 else (b, c, beyond)
         curvature = a - 2.0 * b + c
         if not (curvature > 1e-3 and b < MAX_COST):
             continue

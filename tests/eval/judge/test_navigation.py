@@ -9,7 +9,7 @@ from edgeslam_torch.cli import main
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.runner import Task
 from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, corridor_ends, right_exits
-from edgeslam_torch.eval.judge.navigation.flight import contact_events, fly
+from edgeslam_torch.eval.judge.navigation.flight import fly
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.eval.judge.navigation.perception import WatchedPerception, near_counts
 from edgeslam_torch.eval.judge.navigation.pictures import film_strip, moments, shortest_m, top_view, true_layer
@@ -128,13 +128,6 @@ def test_depth_grows_old_until_there_is_a_newer_one():
     for now_s in (0.8, 1.0, 1.2, 1.4, 1.6):
         perception.state(now_s, [])
     assert perception.depth_age_s == pytest.approx([0.4, 0.6, 0.8, 0.4])
-
-
-def test_touches_in_a_row_are_one_contact():
-    assert contact_events([]) == 0
-    assert contact_events([3.0]) == 1
-    assert contact_events([3.0 + 0.01 * k for k in range(200)]) == 1
-    assert contact_events([3.0, 3.01, 5.0, 5.01, 9.0]) == 3
 
 
 def test_unknown_faults_are_refused():

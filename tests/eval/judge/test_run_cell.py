@@ -103,23 +103,20 @@ def test_a_recordings_own_imu_is_a_cell_of_its_own(recording, tmp_path):
 
 
 def test_simulated_flight_is_judged_by_its_world(tmp_path, monkeypatch):
-    folders = []
-
     def record(root, course, seed, flight):
-        assert flight == 0
-        folders.append(root / course)
-        record_course(folders[0], COURSES[course], seed, seconds=0.4)
-        return folders[0]
+        record_course(root / course, COURSES[course], seed, seconds=0.4)
+        return root / course
 
     monkeypatch.setattr(flights, "flight_folder", record)
-    result = run(tmp_path, Cell("flight/blank_corridor", 3, course="blank_corridor"))
-    assert result["figures"]["frames"] == 8
-    assert result["figures"]["path_m"] > 0
-    assert folders == [tmp_path / "flights" / "blank_corridor"]
-    assert Truth(None).surfaces is None
-    surfaces = run_cell.opened(Cell("flight/corridor", 3, course="corridor"), tmp_path, tmp_path)[1].surfaces
+    source, truth = run_cell.opened(Cell("flight/blank_corridor", 3, course="blank_corridor"), tmp_path, tmp_path)
+    assert source.length == len(truth.trajectory()) == 8
     floor = np.array([[0.0, 0.0, -0.25]])
-    assert surfaces(floor) == pytest.approx([0.25], abs=0.01), "the floor is at height 0, a rug 8 mm above"
+    assert truth.surfaces(floor) == pytest.approx([0.25], abs=0.01), "the floor is at height 0"
+
+
+def test_map_of_a_simulation_is_judged_by_its_surfaces(recording, judged):
+    figures, _ = score(judged[0] / "run", Truth(recording, surfaces=stairs_world().distance_to_surface))
+    assert figures["map_judged"] == 1.0 and 0.0 < figures["map_median_m"] < 0.05 and figures["map_within_10cm"] > 0.8
 
 
 @pytest.mark.parametrize("kind", ["noise", "black", pytest.param("frozen", marks=pytest.mark.slow)])

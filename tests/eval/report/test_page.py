@@ -93,34 +93,36 @@ def test_a_large_map_is_shown_by_a_part_of_its_points(run, monkeypatch):
     assert len(Page(write_report(run)).text["edges-data"]) == pytest.approx(0.4 * whole, rel=0.02)
 
 
-def test_pieces_are_named_with_their_seconds(run):
-    spans = ((0.0, 8.133333), (8.166667, 11.466667))
-    pieces = [{"number": k, "supported": 5, "first_s": a, "last_s": b} for k, (a, b) in enumerate(spans)]
-    story = Page(write_report(with_summary(run, pieces=pieces))).data["story"]
-    assert "piece 0 from 0.0 to 8.1 s, piece 1 from 8.2 to 11.5 s" in story
+PIECES = [
+    {"number": k, "supported": 5, "first_s": a, "last_s": b} for k, (a, b) in enumerate([(0, 8.133), (8.167, 11)])
+]
+SEEN = {"joins": ["piece 1 joined piece 0"], "loops": [f"loop {k} closed" for k in range(7)]}
 
 
-def test_joins_and_loops_are_told_with_their_evidence(run):
-    joins, loops = ["piece 1 joined piece 0: 2 keyframes agree"], [f"loop {k} closed" for k in range(7)]
-    story = Page(write_report(with_summary(run, joins=joins, loops=loops))).data["story"]
-    assert "Places were seen again: piece 1 joined piece 0: 2 keyframes agree; loop 0 closed; " in story
-    assert "loop 3 closed; and 3 more." in story and "loop 4" not in story
-
-
-@pytest.mark.parametrize("said", [None, "loop", 3, {}, [None, 3, ""]])
-def test_a_summary_without_joins_tells_of_none(run, said):
-    assert "seen again" not in Page(write_report(with_summary(run, joins=said, loops=said))).data["story"]
-
-
-def test_a_run_that_never_tracked_was_not_never_lost(run):
-    lines = (run / "status.csv").read_text().splitlines()
-    at = lines[0].split(",").index("status")
-    rows = [line.split(",") for line in lines[1:]]
-    kept = [",".join([*row[:at], "starting", *row[at + 1 :]]) for row in rows]
-    (run / "status.csv").write_text("\n".join([lines[0], *kept]) + "\n")
-    story = Page(write_report(with_summary(run, lost_events=0))).data["story"]
-    assert "of the frames were tracked" in story
-    assert "lost" not in story
+@pytest.mark.parametrize(
+    ("summary", "lost_as", "told", "untold"),
+    [
+        ({"pieces": PIECES}, "lost", ["piece 0 from 0.0 to 8.1 s, piece 1 from 8.2 to 11.0 s"], []),
+        (SEEN, "lost", ["seen again: piece 1 joined piece 0; loop 0", "loop 3 closed; and 3 more."], ["loop 4"]),
+        *[({"joins": no, "loops": no}, "lost", [], ["seen again"]) for no in (None, "loop", 3, {}, [None, 3, ""])],
+        ({"offered": 200, "lost_events": 1}, "tracked", ["lost once"], ["Every frame was tracked"]),
+        ({"offered": 200, "lost_events": 0}, "tracked", ["Every frame was tracked", "never lost"], []),
+        ({"lost_events": 0}, "starting", ["of the frames were tracked"], ["lost"]),
+        (
+            {"offered": 400, "left_out": 150, "dropped_frames": 50},
+            "lost",
+            ["400 frames,", "150 of them were left out", "50 of them were dropped", "49.2\u00a0% of the frames"],  # 197
+            [],
+        ),
+    ],
+)
+def test_story_tells_what_happened(run, summary, lost_as, told, untold):
+    """``lost_as``: status of the frames that were lost; ``starting`` of all of them."""
+    table = (run / "status.csv").read_text()
+    every = "initialised|tracked|relocalised|" if lost_as == "starting" else ""
+    (run / "status.csv").write_text(re.sub(f"\\b({every}predicted|lost)\\b", lost_as, table))
+    story = Page(write_report(with_summary(run, **summary), judge_map=False)).data["story"]
+    assert all(text in story for text in told) and not any(text in story for text in untold), story
 
 
 def test_warnings_of_the_run_stand_under_its_story(run):
@@ -162,24 +164,6 @@ def test_page_tells_nothing_about_the_disk(run):
 )
 def test_paths_that_leave_the_run_keep_their_last_name_only(text, shown):
     assert without_folders(text) == shown
-
-
-def test_page_counts_the_frames_that_the_terminal_counts(run):
-    page = Page(write_report(with_summary(run, offered=400, left_out=150, dropped_frames=50), judge_map=False))
-    assert "400 frames," in page.data["story"]
-    assert "150 of them were left out" in page.data["story"]
-    assert "50 of them were dropped to keep up." in page.data["story"]
-    assert "49.2\u00a0% of the frames were tracked" in page.data["story"]  # 197 of 400
-
-
-def test_a_loss_that_was_made_good_is_not_told_as_a_contradiction(run):
-    table = (run / "status.csv").read_text()
-    (run / "status.csv").write_text(re.sub("predicted|lost", "tracked", table))
-    frames = len(table.splitlines()) - 1
-    story = Page(write_report(with_summary(run, offered=frames, lost_events=1), judge_map=False)).data["story"]
-    assert "lost once" in story and "Every frame was tracked" not in story
-    story = Page(write_report(with_summary(run, offered=frames, lost_events=0), judge_map=False)).data["story"]
-    assert "never lost" in story and "Every frame was tracked" in story
 
 
 @pytest.mark.parametrize("value", [None, "text", [1], {"value": []}, -1, 10**400, True])

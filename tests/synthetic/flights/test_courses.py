@@ -40,7 +40,7 @@ def path_m(flight):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] if n in ("building", "block") else []) for n in COURSES]
+    "name", [pytest.param(n, marks=[pytest.mark.slow] if n.startswith(("building", "block")) else []) for n in COURSES]
 )
 def test_course_keeps_clear_of_walls_and_furniture(name):
     world, flight = flight_of(name)
