@@ -76,14 +76,14 @@ class Ring:
             keyframe = make_keyframe(
                 self.map.next_keyframe_id(), 10 * k, float(k), sim3.moved_camera(self.moved(k), T_c_w), features
             )
-            for i, key in enumerate(zip(seen.tolist(), times.tolist(), strict=True)):
-                if key not in passed:
-                    at = angle[key[0]] / STEP + ROUND * key[1]
-                    p = sim3.transform(self.moved(at), self.p_w[key[0]][None])
-                    passed[key] = self.map.anchors.add(
-                        p, words(descriptors[key[0]][None]), k, False, np.zeros((1, 3), np.uint8)
-                    )[0]
-                keyframe.anchor[i] = passed[key]
+            keys = list(zip(seen.tolist(), times.tolist(), strict=True))
+            new = [i for i, key in enumerate(keys) if key not in passed]
+            at = (angle[seen] / STEP + ROUND * times)[new]
+            S = self.moved(at)
+            p = (S[:, :3, :3] @ self.p_w[seen[new], :, None])[..., 0] + S[:, :3, 3]
+            ids = self.map.anchors.add(p, words(descriptors[seen[new]]), k, False, np.zeros((len(new), 3), np.uint8))
+            passed |= zip([keys[i] for i in new], ids.tolist(), strict=True)
+            keyframe.anchor[:] = [passed[key] for key in keys]
             self.map.add_keyframe(keyframe)
         anchors = self.map.anchors
         single = np.flatnonzero(anchors.alive & (anchors.observations < 2))
@@ -98,7 +98,7 @@ class Ring:
             self.log.append(keyframe.frame_index, keyframe.stamp_s, keyframe.id, near, True)
 
     def moved(self, k):
-        return sim3.exp(k * self.drift)
+        return sim3.exp(np.multiply.outer(k, self.drift))
 
     def graph(self, metres=lambda _: None, along=lambda *_: None):
         return SubmapGraph(self.map, self.log, metres_around=metres, metres_along=along)

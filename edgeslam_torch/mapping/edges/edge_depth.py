@@ -193,7 +193,7 @@ def _search(
             fine[i] = _interpolated(grey[0], uv[e, 0] + px * normal[e, 0], uv[e, 1] + px * normal[e, 1])
         for k in range(3):  # one call and not three: the compiler copies what is called, which takes seconds
             lowest[k] = _fine_cost(grey, ray, along, across, share, fine, rho + (k - 1) * step)
-        a, b, c = lowest
+        a, b, c = float(lowest[0]), float(lowest[1]), float(lowest[2])
         way = -1.0 if a < c else 1.0
         for _ in range(2):
             if b <= (a if way < 0.0 else c):
