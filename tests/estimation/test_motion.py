@@ -496,6 +496,7 @@ def test_a_real_tello_truncates_its_velocities(data_dir):
     assert track.truncation_log_odds(0.1) > 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize(("sequence", "limit"), [("tum_fr1_xyz", 0.02), ("7scenes_redkitchen", 0.04)])
 def test_scale_of_recorded_motion(data_dir, recorded, replay, rng, sequence, limit):

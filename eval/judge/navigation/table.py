@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import binomtest
 
 from edgeslam_torch.eval.experiment.conditions import code_state
 from edgeslam_torch.eval.experiment.runner import Local, Task, run_tasks
@@ -92,6 +91,8 @@ def _line(flown: Flown) -> str:
 
 def _share(successes: int, trials: int) -> str:
     """Number and 95 % interval of its share (Wilson 1927)."""
+    from scipy.stats import binomtest  # a second to import
+
     low, high = binomtest(successes, trials).proportion_ci(method="wilson") if trials else (0.0, 1.0)
     return f"{successes} ({100 * low:.0f} to {100 * high:.0f} %)"
 
