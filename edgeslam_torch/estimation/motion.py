@@ -372,7 +372,6 @@ class MotionFusion:
             return None
         there = self._track.heights()
         heights = [reading for reading in HEIGHTS if reading in there and self._trust.height(reading)]
-        odds = self._trust.at_odds  # sources that are not used for the scale must not constrain the map either
         return TelemetryModel(
             self._track,
             self.config,
@@ -383,7 +382,7 @@ class MotionFusion:
             1.0 if scale is None else math.exp(scale.log_scale),
             math.inf if scale is None else scale.sigma,
             self.metres.velocity_constrains_map(self._trust),
-            heights[0] if scale is not None and heights and (odds is None or odds.kept == "height") else None,
+            heights[0] if scale is not None and heights and "height" not in self.metres.decided.rejected else None,
             self.metres.fit.truncates,
             self._trust.attitude,
             standing=scale is not None and self.metres.velocity_is_right(self._trust),
@@ -424,16 +423,15 @@ class MotionFusion:
         orientation.found = turned
         present = FlightSoFar(self._memory, self._track, turned.R_b_c, metres.rough(), metres.network())
         self._comparison.judge(self._trust, present, self.flight.delay.delay, turned.R_w_m, flying)
-        self._trust.at_odds = None
         previous_scale = metres.previous_scale()
 
         def scale(trust: SensorGate) -> TelemetryScale:
             T_b_c = orientation.T_b_c
             return TelemetryScale(self.config, T_b_c, present, trust, self.delay_s, turned, previous_scale, flying)
 
-        metres.take(scale(self._trust).opinion(), self._trust)
+        metres.take(*scale(self._trust).beliefs(), self._trust)
         guesses = flying and metres.sensor_scale is None
-        metres.provisional_scale(scale(self._trust.supposing_heights()).opinion() if guesses else None)
+        metres.provisional_scale(scale(self._trust.supposing_heights()).beliefs()[0] if guesses else {})
         oldest = self._memory.sightings().stamps_s[0]
         self._drift = drift_in_words(self.scale_around, float(oldest), last.stamp_s)
 

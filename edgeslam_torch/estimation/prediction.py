@@ -123,8 +123,6 @@ class TelemetryPropagation:
         if self.R_w_m is None or not math.isfinite(scale.sigma):
             return PoseEstimate(stamp_s, T, math.inf, math.hypot(0.01 + 0.01 * gap, late_rad), "telemetry")
         moved = np.diff(self.track.displacement(times, self.fit.shortfall_m_s), axis=0)[0]
-        if self.fit.moved is not None:
-            moved = moved - self.fit.moved.bias * gap
         moved = moved + (R_w_b[1] - R_w_b[0]) @ self.T_b_c[:3, 3]
         T[:3, 3] = last.T[:3, 3] + self.R_w_m.T @ moved / scale.value
         walk = VELOCITY_M_S * math.sqrt(0.1 * gap) + 0.02 * gap

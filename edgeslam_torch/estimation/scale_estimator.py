@@ -1,13 +1,12 @@
-"""Metres per map unit from telemetry, the depth network and an earlier flight."""
+"""Metres per map unit: the belief of each source, and what is decided from them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from edgeslam_torch.estimation.config import FusionConfig
-from edgeslam_torch.estimation.scale.consensus import Settled, settled_with_network
-from edgeslam_torch.estimation.scale.depth_scale import DepthRatio, DepthRatios, DepthScale
-from edgeslam_torch.estimation.scale.log_scale import LogScale, fuse
+from edgeslam_torch.estimation.scale.belief import Decision, ScaleBelief, decide, mean
+from edgeslam_torch.estimation.scale.depth_scale import DepthRatio, DepthRatios
 from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, SensorGate
 from edgeslam_torch.estimation.telemetry_scale import TelemetryFit
 from edgeslam_torch.noise import DEPTH_SCALE_LOG
@@ -21,9 +20,7 @@ wrong by several times they would distort it."""
 _FOCAL_SHARE = 0.4
 """Share of a focal length's relative error that the scale from telemetry inherits; set on recordings with focal lengths
 of 0.7 to 1.5 times the true one."""
-
-Found = tuple[LogScale, TelemetryFit]
-"""A scale by telemetry, and the details of its fit."""
+_TELEMETRY = "telemetry", "height"
 
 
 class ScaleEstimator:
@@ -39,17 +36,17 @@ class ScaleEstimator:
         self._depth = DepthRatios(DEPTH_SCALE_LOG)
         truncates = config.velocity_rounding == "truncate"
         self.fit = TelemetryFit(shortfall_m_s=0.5 * config.velocity_step_m_s if truncates else 0.0)
-        """Details of the fit of `sensor_scale`."""
-        self.sensor_scale: LogScale | None = None
-        """Scale by the drone's own sensors; unchanged without new measurements."""
+        """Details of the newest fit of velocities."""
         self.guess: ScaleEstimate | None = None
         """Scale by a climb before telemetry is validated; None afterwards. Not metric: only a better initial value of
         the published scale than the depth network's."""
-        self.inertial: LogScale | None = None
+        self.inertial: ScaleBelief | None = None
         """Scale by an IMU; None while it is not observable."""
-        self._remembered: LogScale | None = None
-        self._scale = ScaleEstimate()
-        self._rests_on: tuple[LogScale | DepthScale | None, ...] = ()
+        self._by_telemetry: dict[str, ScaleBelief] = {}
+        """By velocities (``telemetry``) and ``height``; unchanged without new measurements."""
+        self._remembered: ScaleBelief | None = None
+        self._beliefs: tuple[ScaleBelief, ...] = ()
+        self._decided, self._scale = Decision(), ScaleEstimate()
 
     # --- input ---------------------------------------------------------------------------------------------------
 
@@ -68,55 +65,69 @@ class ScaleEstimator:
 
         It replaces the depth network's estimate, whose error in a place is the same in every flight.
         """
-        if scale is None or not math.isfinite(scale.sigma):
-            self._remembered = None
-        else:
-            self._remembered = LogScale(math.log(scale.value), scale.sigma / scale.value, "atlas")
+        known = scale is not None and math.isfinite(scale.sigma)
+        self._remembered = ScaleBelief(math.log(scale.value), scale.sigma / scale.value, "atlas") if known else None
 
-    def take(self, found: Found | None, trust: SensorGate) -> None:
+    def take(self, found: Mapping[str, ScaleBelief], fit: TelemetryFit | None, trust: SensorGate) -> None:
         """Update with telemetry.
 
         Args:
-            found: Its scale.
-            trust: Usable readings; a scale that rests on others is dropped.
+            found: Its beliefs by source; empty where it tells no scale.
+            fit: Details of the fit.
+            trust: Usable readings; beliefs that rest on others are dropped.
         """
-        if found is not None:
-            self.fit = found[1]
-        if found is not None and found[0].sigma < _BELIEVED:
-            self.sensor_scale = found[0]
-        elif not self._still_trusted(trust) or self._of_heights():
-            self.sensor_scale, self.fit = None, TelemetryFit(shortfall_m_s=self.fit.shortfall_m_s)
-        # else no new information: hover, pure rotation, or no telemetry
+        if fit is not None:
+            self.fit = fit
+        before, self._by_telemetry = self._by_telemetry, dict(found)
+        together = mean(list(found.values()))
+        sure = together is not None and min(together.sigma, *(b.sigma for b in found.values())) < _BELIEVED
+        if not sure:  # no new information: hover, pure rotation, or no telemetry
+            trusted = {"telemetry": trust.velocity and trust.tells_scale, "height": any(map(trust.height, HEIGHTS))}
+            # Heights alone are void once the map's vertical has changed.
+            keep = set(before) != {"height"} and all(trusted[source] for source in before)
+            self._by_telemetry = before if keep else {}
 
-    def provisional_scale(self, found: Found | None) -> None:
+    def provisional_scale(self, found: Mapping[str, ScaleBelief]) -> None:
         """Update the guess with heights that are not validated yet."""
-        self.guess = None
-        if found is not None and found[0].sigma < _BELIEVED:
-            self.guess = _estimate(found[0])
+        guess = mean(list(found.values()))
+        self.guess = None if guess is None or guess.sigma >= _BELIEVED else guess.estimate
 
     def follow(self, log_ratio: float) -> None:
         """Adapt the scale to a map that has grown by ``exp(log_ratio)``."""
-        if self.sensor_scale is not None:
-            self.sensor_scale = replace(self.sensor_scale, log_scale=self.sensor_scale.log_scale - log_ratio)
-
-    def _of_heights(self) -> bool:
-        """Whether the scale rests on heights alone, which are void once the map's vertical has changed."""
-        return self.sensor_scale is not None and self.sensor_scale.source == "height"
-
-    def _still_trusted(self, trust: SensorGate) -> bool:
-        """Whether all sources of the present scale are still usable."""
-        trusted = {"telemetry": trust.velocity and trust.tells_scale, "height": any(map(trust.height, HEIGHTS))}
-        settled = trust.at_odds is None or trust.at_odds.kept is not None
-        return settled and all(trusted[source] for source in self.fit.sources)
+        self._by_telemetry = {
+            name: replace(belief, log_scale=belief.log_scale - log_ratio) for name, belief in self._by_telemetry.items()
+        }
 
     # --- output --------------------------------------------------------------------------------------------------
 
+    @property
+    def decided(self) -> Decision:
+        """Which sources are used; cached, since it is asked several times a frame."""
+        depth = self._depth.scale()
+        beliefs = [self._with_focal(b, _FOCAL_SHARE) for b in self._by_telemetry.values()]
+        # An earlier flight's scale includes the network's; beside an IMU neither says anything.
+        network = self.network() if self._remembered is None else self._remembered
+        beliefs += [self.inertial] if self.inertial is not None else [network] if network is not None else []
+        if tuple(beliefs) != self._beliefs:
+            self._beliefs = tuple(beliefs)
+            self._decided = decide(beliefs, only_witness=depth is not None and not depth.in_domain)
+            others = [b for b in self._decided.used if b.source not in _TELEMETRY]
+            used = mean(([] if self.sensor_scale is None else [self.sensor_scale]) + others)
+            self._scale = ScaleEstimate() if used is None else used.estimate
+        return self._decided
+
+    @property
+    def sensor_scale(self) -> ScaleBelief | None:
+        """Scale by the drone's velocities and heights, if they are accurate enough."""
+        used = {b.source for b in self.decided.used}
+        measured = mean([belief for name, belief in self._by_telemetry.items() if name in used])
+        if measured is None or measured.sigma >= _BELIEVED:
+            return None
+        return self._with_focal(measured, _FOCAL_SHARE)
+
     def scale(self) -> ScaleEstimate:
         """Metres per map unit with sigma and source; unchanged without new measurements."""
-        rests_on = self._remembered, self.sensor_scale, self.inertial, self._depth.scale()
-        if rests_on != self._rests_on:  # cached, since it is used several times a frame
-            self._rests_on, self._scale = rests_on, fuse(self._settled().used)
-        return self._scale
+        return self._scale if self.decided.used else ScaleEstimate()
 
     def previous_scale(self) -> float | None:
         """Scale by telemetry alone."""
@@ -132,10 +143,15 @@ class ScaleEstimator:
         unit = self.network_unit()
         return self.previous_scale() if unit is None else unit
 
-    def network(self) -> LogScale | None:
-        """The depth network's estimate including the uncertainty of the focal length."""
+    def network(self) -> ScaleBelief | None:
+        """The depth network's estimate. Map depth and network depth scale with the focal length: their ratio has its
+        whole uncertainty."""
         depth = self._depth.scale()
-        return None if depth is None else self._with_focal(depth)
+        return None if depth is None else self._with_focal(depth.belief, 1.0)
+
+    def _with_focal(self, belief: ScaleBelief, share: float) -> ScaleBelief:
+        """With a share of the focal length's error, which is common to all that a source measures."""
+        return replace(belief, sigma=math.hypot(belief.sigma, share * self._focal_sigma))
 
     def velocity_constrains_map(self, trust: SensorGate) -> bool:
         """Whether velocities may constrain the map: not with an inaccurate scale from heights alone."""
@@ -146,18 +162,16 @@ class ScaleEstimator:
 
     def velocity_is_right(self, trust: SensorGate) -> bool:
         """Whether velocities are validated and consistent with the sources in use."""
-        return trust.velocity and (trust.at_odds is None or trust.at_odds.kept == "telemetry")
+        return trust.velocity and "telemetry" not in self.decided.rejected
 
     def sources(self) -> tuple[ScaleEstimate, ...]:
         """Scale by each source alone, used or not."""
-        measured = [ScaleEstimate(s.value, s.sigma, name) for name, s in self.fit.sources.items()]
         others = self.inertial, self.network(), self._remembered
-        measured += [_estimate(known) for known in others if known is not None]
-        return tuple(measured)
+        return tuple(b.estimate for b in (*self._by_telemetry.values(), *others) if b is not None)
 
     def contradiction(self) -> str | None:
         """Warning of contradicting sources."""
-        return self._settled().warning
+        return self.decided.warning
 
     def warnings(self) -> list[str]:
         """The same, and a warning of the depth network where its metres are needed."""
@@ -167,28 +181,9 @@ class ScaleEstimator:
 
     def statistics(self) -> dict[str, float]:
         """Each source, for the report."""
-        numbers = {} if self.fit.moved is None else {"displacement residual m": self.fit.moved.rms_m}
-        for name, source in self.fit.sources.items():
-            numbers[f"scale {name}"], numbers[f"scale {name} sigma"] = source.value, source.sigma
+        numbers = {} if self.fit.rms_m is None else {"displacement residual m": self.fit.rms_m}
+        for name, belief in self._by_telemetry.items():
+            known = belief.estimate
+            numbers[f"scale {name}"], numbers[f"scale {name} sigma"] = known.value, known.sigma
         depth = self._depth.scale()
         return numbers if depth is None else numbers | depth.statistics()
-
-    def _settled(self) -> Settled:
-        """Estimates that may be averaged."""
-        measured, depth = self.sensor_scale, self._depth.scale()
-        if measured is not None:
-            measured = replace(measured, sigma=math.hypot(measured.sigma, _FOCAL_SHARE * self._focal_sigma))
-        if self.inertial is not None:  # a unit that cannot be mistaken, with a sigma that is below any network's
-            return Settled(tuple(known for known in (self.inertial, measured) if known is not None))
-        if self._remembered is not None:  # which includes the network's estimate
-            return settled_with_network(measured, self._remembered, True)
-        return settled_with_network(measured, self.network(), depth is not None and depth.in_domain)
-
-    def _with_focal(self, depth: DepthScale) -> LogScale:
-        """Map depth and network depth scale with the focal length: the ratio has its whole uncertainty."""
-        return replace(depth.opinion, sigma=math.hypot(depth.sigma, self._focal_sigma))
-
-
-def _estimate(known: LogScale) -> ScaleEstimate:
-    value = math.exp(known.log_scale)
-    return ScaleEstimate(value, value * known.sigma, known.source)

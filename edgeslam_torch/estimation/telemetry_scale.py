@@ -1,23 +1,21 @@
 """Metric scale from the drone's velocities and heights, each alone and combined."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.scale.belief import ScaleBelief, contradict
 from edgeslam_torch.estimation.scale.camera_mount import Turned
-from edgeslam_torch.estimation.scale.consensus import CONTRADICTION, at_odds, contradict, sided_with
 from edgeslam_torch.estimation.scale.joint_scale import (
     MIN_DISPLACEMENTS,
     Evidence,
     aged_since,
     displacement_evidence,
     height_evidence,
-    solved,
     turned_since,
 )
-from edgeslam_torch.estimation.scale.log_scale import LogScale
 from edgeslam_torch.estimation.sensors.height import floor_segments
 from edgeslam_torch.estimation.sensors.velocity import (
     Rounding,
@@ -27,7 +25,6 @@ from edgeslam_torch.estimation.sensors.velocity import (
 )
 from edgeslam_torch.estimation.telemetry.comparison import FlightSoFar
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
-    AtOdds,
     Reading,
     SensorGate,
     agreement,
@@ -52,8 +49,9 @@ _MOST_CHANGE = 0.5
 _UNDITHERED = 0.05
 """Residual error of the remainders [steps]. With 0.2 to 0.3 steps of noise before rounding, the mean reading is off by
 0.15 to 0.05 steps with a sign that varies with speed; averaging over speeds leaves about two thirds."""
-_MOST_SIGMA = 0.5
-"""Relative sigma above which a single source is discarded."""
+_UNPROVEN = 15.0
+"""Number of intervals up to which residuals hardly tell rounding modes apart: at similar speeds quantisation errors repeat,
+and the map's own errors may look like either."""
 _GOOD_HEIGHT = 0.2
 """Relative sigma at which the search stops: the remaining height sources observe the same motion less accurately."""
 _HEIGHT_BIN_S = 0.5
@@ -70,54 +68,15 @@ _MOST_STEPS = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class SourceScale:
-    """Scale from one source alone."""
-
-    value: float
-    """Metres per map unit."""
-    sigma: float
-
-
-@dataclass(frozen=True, slots=True)
 class TelemetryFit:
-    """Result of the newest fit, for prediction and for the report."""
+    """Result of the newest fit of velocities, for prediction and for the report."""
 
-    moved: Evidence | None = None
-    """From displacements."""
-    sources: dict[str, SourceScale] = field(default_factory=dict)
-    """Velocities (``telemetry``) and ``height``, each alone."""
+    rms_m: float | None = None
+    """RMS residual of the displacements."""
     shortfall_m_s: float = 0.0
     """Expected truncation loss of every non-zero velocity reading."""
     truncates: float = 0.5
     """Probability that velocities are truncated, not rounded."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Hypothesis:
-    """Scale under one rounding mode of the velocities."""
-
-    log_scale: float
-    sigma: float
-    log_odds: float
-    """Log-likelihood of the displacements up to a constant, with a penalty on the gap between velocity and height."""
-    fit: TelemetryFit
-    at_odds: AtOdds | None
-
-
-@dataclass(frozen=True, slots=True)
-class _Given:
-    """One kind of evidence with the scale that it gives alone."""
-
-    name: str
-    evidence: Evidence
-    scale: float
-    sigma: float
-    """Relative."""
-
-    @property
-    def opinion(self) -> LogScale:
-        """The estimate in the log domain."""
-        return LogScale(math.log(self.scale), self.sigma, self.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,104 +145,63 @@ class TelemetryScale:
         self._flying = flying
         self._shown = self._compared() if trust.velocity else None
 
-    def opinion(self) -> tuple[LogScale, TelemetryFit] | None:
-        """Scale averaged over both rounding modes; ``None`` without a usable source.
+    def beliefs(self) -> tuple[dict[str, ScaleBelief], TelemetryFit | None]:
+        """Scale by velocities (``telemetry``) and by ``height``, each alone, and details of the fit.
 
-        Modes are weighted by their posterior probability: sweeps through zero, likelihood of the displacements, and
-        consistency of velocity and height. The sigma covers both modes.
+        That of velocities is averaged over both rounding modes, weighted by their posterior probability: sweeps through
+        zero, and likelihood of the displacements. Its sigma covers both modes.
         """
         config = self._config
         fixed = {"nearest": Rounding.NEAREST, "truncate": Rounding.TRUNCATE}.get(config.velocity_rounding)
         sweeps = 0.0 if fixed else self._present.track.truncation_log_odds(config.velocity_step_m_s)
-        systematic = {
-            Rounding.NEAREST: VELOCITY_SCALE_LOG,
-            Rounding.TRUNCATE: VELOCITY_TRUNCATED_SCALE_LOG,
-        }
-        tried = (Rounding.NEAREST, Rounding.TRUNCATE) if fixed is None else (fixed,)
-        moved = {r: self._by_displacements(r) for r in tried}
-        compared = all(evidence is not None for evidence in moved.values())
-        if not compared:  # the rounding modes compare only if both have displacements
-            moved = dict.fromkeys(tried)
+        tried = tuple(Rounding) if fixed is None else (fixed,)
+        moved = {r: e for r in tried if (e := self._by_displacements(r)) is not None}
+        compared = len(moved) == len(tried)  # the rounding modes compare only if both have displacements
         few = self._shown is None or len(self._shown.intervals) < MIN_DISPLACEMENTS
-        torn = all(evidence is not None and evidence.torn for evidence in moved.values())
+        torn = compared and all(evidence.torn for evidence in moved.values())
         self._trust.tells_scale = few or (compared and not torn)
         if torn:
-            return None
-        found = {r: h for r in tried if (h := self._together(r, moved[r], systematic[r])) is not None}
-        if not found:
-            return None
-        log_odds = np.array([h.log_odds + (sweeps if r is Rounding.TRUNCATE else 0.0) for r, h in found.items()])
-        share = np.exp(log_odds - log_odds.max())
-        share /= share.sum()
-        mixed = list(zip(share.tolist(), found.values(), strict=True))
-        best = max(mixed, key=lambda m: m[0])[1]
-        self._trust.at_odds = best.at_odds
-        mean = sum(p * o.log_scale for p, o in mixed)
-        variance = sum(p * (o.sigma**2 + (o.log_scale - mean) ** 2) for p, o in mixed)
-        truncates = dict(zip(found, share.tolist(), strict=True)).get(Rounding.TRUNCATE, 0.0)
-        fit = replace(best.fit, truncates=truncates)
-        return LogScale(mean, math.sqrt(variance), "+".join(fit.sources)), fit
+            return {}, None
+        velocity = {r: v for r, e in moved.items() if (v := self._by_velocity(r, e)) is not None} if compared else {}
+        height: ScaleBelief | None = None
+        log_odds = {r: sweeps if r is Rounding.TRUNCATE else 0.0 for r in velocity or tried}
+        if velocity:
+            best = max(velocity, key=lambda r: moved[r].log_likelihood)
+            height = self._height_alone(velocity[best], moved[best])
+            count = 0 if self._shown is None else len(self._shown.intervals)
+            counts = count / (count + _UNPROVEN)
+            log_odds = {r: odds + counts * moved[r].log_likelihood for r, odds in log_odds.items()}
+        else:
+            height = self._height_alone(None, None)
+        share = np.exp(np.array(list(log_odds.values())) - max(log_odds.values()))
+        weight = dict(zip(log_odds, (share / share.sum()).tolist(), strict=True))
+        found = {} if height is None else {"height": height}
+        rms = None
+        if velocity:
+            mean = sum(weight[r] * v.log_scale for r, v in velocity.items())
+            variance = sum(weight[r] * (v.sigma**2 + (v.log_scale - mean) ** 2) for r, v in velocity.items())
+            found = {"telemetry": ScaleBelief(mean, math.sqrt(variance), "telemetry")} | found
+            rms = moved[max(velocity, key=lambda r: weight[r])].rms_m
+        truncates = weight.get(Rounding.TRUNCATE, 0.0)
+        shortfall_m_s = 0.5 * config.velocity_step_m_s if truncates > 0.5 else 0.0
+        return found, TelemetryFit(rms, shortfall_m_s, truncates) if found else None
 
-    def _together(self, rounding: Rounding, moved: Evidence | None, systematic: float) -> _Hypothesis | None:
-        tilt = self._tilt_rad
-        rough = self._rough(moved)
+    def _by_velocity(self, rounding: Rounding, moved: Evidence) -> ScaleBelief | None:
+        systematic = VELOCITY_TRUNCATED_SCALE_LOG if rounding is Rounding.TRUNCATE else VELOCITY_SCALE_LOG
+        return moved.belief("telemetry", self._tilt_rad, systematic)
+
+    def _height_alone(self, velocity: ScaleBelief | None, moved: Evidence | None) -> ScaleBelief | None:
+        """Scale by heights; floor steps are found with the scale by velocities, unless the network contradicts it."""
+        network, known = self._present.network, self._present.rough_scale
+        rough = None if velocity is None else velocity.estimate.value
+        if rough is None or (velocity is not None and network is not None and contradict(velocity, network)):
+            rough = self._shown.start if known is None and self._shown is not None else known
         if rough is None:
             return None
-        velocity = self._alone("telemetry", moved, systematic, rough)
         # Velocities less accurate than the scale difference between views cannot rule it out.
         vouching = moved if velocity is not None and velocity.sigma < _OF_A_VIEW else None
-        given = [g for g in (velocity, self._height_alone(rough, vouching)) if g is not None]
-        odds = self._at_odds(*given) if len(given) == 2 else None
-        if odds is not None and odds.kept is not None:
-            given = [g for g in given if g.name == odds.kept]
-            if odds.kept == "height":  # recompute without the drift model of the rejected velocities
-                given = [g for g in (self._height_alone(rough, None),) if g is not None]
-        together = solved([g.evidence for g in given], tilt) if given else None
-        if together is None:
-            return None
-        gap = parted_log = 0.0
-        if len(given) == 2:
-            one, other = (g.opinion for g in given)
-            gap = abs(one.log_scale - other.log_scale) / math.hypot(one.sigma, other.sigma)
-            if contradict(one, other):  # one of the two is wrong: the sigma covers both
-                parted_log = abs(one.log_scale - other.log_scale)
-        sources = {g.name: SourceScale(g.scale, g.scale * g.sigma) for g in given}
-        # Birge ratio: disagreement beyond the sigmas widens the result.
-        sigma = max(parted_log, max(1.0, gap) * together[1])
-        log_odds = (0.0 if moved is None else moved.log_likelihood) - 0.5 * min(gap, CONTRADICTION) ** 2
-        moved = moved if "telemetry" in sources else None
-        shortfall_m_s = 0.5 * self._config.velocity_step_m_s if rounding is Rounding.TRUNCATE else 0.0
-        fit = TelemetryFit(moved, sources, shortfall_m_s)
-        return _Hypothesis(math.log(together[0]), sigma, log_odds, fit, odds)
-
-    def _alone(self, name: str, evidence: Evidence | None, systematic: float, rough: float) -> _Given | None:
-        """Scale from one kind of evidence, with its systematic error."""
-        if evidence is None:
-            return None
-        evidence = evidence.softened(systematic * rough)
-        single = solved([evidence], self._tilt_rad)
-        return None if single is None or single[1] >= _MOST_SIGMA else _Given(name, evidence, *single)
-
-    def _height_alone(self, rough: float, moved: Evidence | None) -> _Given | None:
-        return self._alone("height", self._by_height(rough, moved), HEIGHT_SCALE_LOG, rough)
-
-    def _at_odds(self, velocity: _Given, height: _Given) -> AtOdds | None:
-        """Contradictory scales from velocities and heights, and which of them the depth network supports."""
-        one, other = velocity.opinion, height.opinion
-        if not at_odds(one, other):
-            return None
-        kept = sided_with(one, other, self._present.network)
-        return AtOdds(velocity.scale, height.scale, None if kept is None else kept.source)
-
-    def _rough(self, moved: Evidence | None) -> float | None:
-        """Rough scale for detecting floor steps: from velocities, unless the network contradicts them."""
-        network = self._present.network
-        alone = None if moved is None else solved([moved], self._tilt_rad)
-        if alone is None:
-            known = self._present.rough_scale
-            return self._shown.start if known is None and self._shown is not None else known
-        wrong = network is not None and contradict(LogScale(math.log(alone[0]), alone[1], "telemetry"), network)
-        return self._present.rough_scale if wrong else alone[0]
+        evidence = self._by_height(rough, vouching)
+        return None if evidence is None else evidence.belief("height", self._tilt_rad, HEIGHT_SCALE_LOG)
 
     def _by_displacements(self, rounding: Rounding) -> Evidence | None:
         """Fit velocities to displacements; the quantisation remainders depend on the scale, so iterate to a fixed
@@ -298,7 +216,7 @@ class TelemetryScale:
             lost = shown.velocity.lost(shown.ends_s, scale, step, rounding)
             whole = reported + lost[len(intervals) :] - lost[: len(intervals)]
             evidence = self._evidence(intervals, whole, self._aged(intervals.to_s))
-            alone = None if evidence is None else solved([evidence], tilt)
+            alone = None if evidence is None else evidence.solved(tilt)
             if evidence is None or alone is None:
                 return None
             gain = remainder_gain(shown.velocity, intervals, self._R_w_m, scale, step, rounding)
@@ -397,7 +315,7 @@ class TelemetryScale:
             evidence = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt, aged, wander)
             if evidence is not None:
                 evidence = evidence.softened(scale * _by_steps(z[here], HEIGHT_STEP_M[name]))
-            single = solved([evidence], tilt) if evidence is not None else None
+            single = None if evidence is None else evidence.solved(tilt)
             if evidence is not None and single is not None and single[1] < best_sigma:
                 best, best_sigma = evidence, single[1]
             if best_sigma < _GOOD_HEIGHT:

@@ -180,13 +180,14 @@ def test_telemetry_of_another_flight_reckons_nothing(rng, swinging, replay):
     assert told.count(None) == len(told)
 
 
-@pytest.mark.parametrize("source", ["height", "telemetry+height"])
-def test_velocities_on_which_no_metres_rest_carry_nothing(rng, swinging, replay, source):
+@pytest.mark.parametrize("sources", [["height"], ["telemetry", "height"]], ids="+".join)
+def test_velocities_on_which_no_metres_rest_carry_nothing(rng, swinging, replay, sources):
     """Heights told the metres alone, and nothing has compared the velocities with them: they may be cm/s."""
     motion = swinging(24.0)
     fusion = MotionFusion(FusionConfig(), T_B_C)
     replay(fusion, motion, motion.in_gauge(rng), simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples())
     last_s = float(motion.stamps_s[-20])
     assert fusion.reckoned(last_s) is not None
-    fusion.metres.sensor_scale = replace(fusion.metres.sensor_scale, source=source)
-    assert (fusion.reckoned(last_s) is None) == (source == "height")
+    found = {source: replace(fusion.metres.sensor_scale, source=source) for source in sources}
+    fusion.metres.take(found, None, fusion.flight.trust)
+    assert (fusion.reckoned(last_s) is None) == (sources == ["height"])

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.motion import MotionFusion
+from edgeslam_torch.estimation.scale.belief import ScaleBelief
 from edgeslam_torch.estimation.scale.depth_scale import DepthRatio
-from edgeslam_torch.estimation.scale.log_scale import LogScale
 from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
 from edgeslam_torch.estimation.sensors.velocity import Rounding
 from edgeslam_torch.estimation.telemetry_scale import TelemetryFit, TelemetryScale
@@ -411,13 +411,13 @@ def test_small_height_changes_give_no_scale(swinging, replay):
         assert fusion.metres.sensor_scale is None
 
 
-@pytest.mark.parametrize(("source", "held"), [("height", False), ("telemetry+height", True)])
-@pytest.mark.parametrize("found", [None, (LogScale(0.1, 0.4, "height"), TelemetryFit())], ids=["nothing", "unsure"])
-def test_unconfirmed_scale_from_heights_is_withdrawn(source, held, found):
-    trusting = SimpleNamespace(velocity=True, tells_scale=True, height=lambda reading: True, at_odds=None)
+@pytest.mark.parametrize(("sources", "held"), [(["height"], False), (["telemetry", "height"], True)])
+@pytest.mark.parametrize("found", [{}, {"height": ScaleBelief(0.1, 0.4, "height")}], ids=["nothing", "unsure"])
+def test_unconfirmed_scale_from_heights_is_withdrawn(sources, held, found):
+    trusting = SimpleNamespace(velocity=True, tells_scale=True, height=lambda reading: True)
     metres = ScaleEstimator(FusionConfig(), 0.0)
-    metres.take((LogScale(0.0, 0.1, source), TelemetryFit()), trusting)
-    metres.take(found, trusting)
+    metres.take({source: ScaleBelief(0.0, 0.1, source) for source in sources}, TelemetryFit(), trusting)
+    metres.take(found, None, trusting)
     assert (metres.sensor_scale is not None) == held
 
 

@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.motion import MotionFusion
+from edgeslam_torch.estimation.scale.belief import ScaleBelief
 from edgeslam_torch.estimation.scale.camera_mount import Turned
 from edgeslam_torch.estimation.scale.depth_scale import DepthRatio
-from edgeslam_torch.estimation.scale.log_scale import LogScale
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
     Agreement,
-    AtOdds,
     Reading,
     SensorGate,
     Verdict,
@@ -403,31 +402,34 @@ def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, repla
     assert scale.sigma >= 0.9 * heights.scale().sigma
     assert abs(scale.value - gauge.scale) < 2 * scale.sigma
     (warning,) = (w for w in fusion.warnings() if "contradict each other" in w)
-    assert "velocities are not used" in warning
+    assert warning.endswith("not used: telemetry's velocities")
     model = fusion.telemetry()
     assert (model.velocity, model.height) == (False, "tof"), "nor do they pull at the map in its refinement"
 
 
 @pytest.mark.parametrize(
-    ("source", "sigma", "kept", "speaks"),
+    ("beliefs", "speaks", "stands"),
     [
-        ("telemetry+height", 0.28, "", True),
-        ("telemetry", 0.28, "telemetry", True),
-        ("height", 0.1, "", True),
-        ("height", 0.28, "", False),
-        ("telemetry+height", 0.1, "height", False),
-        ("telemetry+height", 0.1, None, False),
+        ({"telemetry": (1.0, 0.35), "height": (1.0, 0.35)}, True, True),
+        ({"height": (1.0, 0.1)}, True, True),
+        ({"height": (1.0, 0.28)}, False, True),
+        ({"telemetry": (10.0, 0.1), "height": (1.0, 0.1), "depth": (1.0, 0.15)}, False, False),
+        ({"telemetry": (10.0, 0.1), "height": (1.0, 0.1)}, False, False),
     ],
 )
-def test_velocities_constrain_the_map_only_with_a_consistent_scale(source, sigma, kept, speaks):
+def test_velocities_constrain_the_map_only_with_a_consistent_scale(beliefs, speaks, stands):
     """A young map's heights may tell a unit several times off at a quarter, and velocities would tear it by that."""
     fusion = MotionFusion(FusionConfig(), T_B_C)
     fusion.orientation.found = Turned(np.eye(3), np.eye(3), np.zeros(3))
-    fusion.metres.sensor_scale = LogScale(0.0, sigma, source)
-    fusion.flight.trust.judge(Reading.VELOCITY, Agreement(0.99, 30))
-    fusion.flight.trust.at_odds = None if kept == "" else AtOdds(10.0, 1.0, kept)
+    fusion.orientation.began_upright = True
+    trust = fusion.flight.trust
+    trust.judge(Reading.VELOCITY, Agreement(0.99, 30))
+    found = {name: ScaleBelief(math.log(value), sigma, name) for name, (value, sigma) in beliefs.items()}
+    for _ in range(100 if found.pop("depth", None) else 0):
+        fusion.metres.add_depth_ratio(DepthRatio(0.0, 0.05))
+    fusion.metres.take(found, None, trust)
     assert fusion.telemetry().velocity is speaks
-    assert fusion.telemetry().standing is (kept in ("", "telemetry")), "that it stands is right in any unit"
+    assert fusion.telemetry().standing is (stands and fusion.metres.sensor_scale is not None)
 
 
 def test_gravity_constrains_an_upright_map_before_the_scale_is_known():

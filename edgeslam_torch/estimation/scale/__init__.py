@@ -1,1 +1,1 @@
-"""Metric scale: estimates of each source, their uncertainty, and consensus between them."""
+"""Metric scale: the belief of each source, and the decision between them."""

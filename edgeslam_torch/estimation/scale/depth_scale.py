@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.estimation.scale.log_scale import LogScale
+from edgeslam_torch.estimation.scale.belief import ScaleBelief
 from edgeslam_torch.geometry.robust_statistics import median, robust_sigma
 from edgeslam_torch.types import FloatArray
 
@@ -113,9 +113,9 @@ class DepthScale:
         return self.sigma <= MOST_SIGMA
 
     @property
-    def opinion(self) -> LogScale:
-        """The estimate in the log domain, for fusion with other sources."""
-        return LogScale(self.log_scale, self.sigma, "depth")
+    def belief(self) -> ScaleBelief:
+        """The estimate, to be decided on beside those of other sources."""
+        return ScaleBelief(self.log_scale, self.sigma, "depth")
 
     def statistics(self) -> dict[str, float]:
         """For the report."""

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_solve, lapack
 
+from edgeslam_torch.estimation.scale.belief import ScaleBelief
 from edgeslam_torch.geometry.robust_statistics import RMS_MEDIAN_3DOF, median, robust_sigma, tukey_weight
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.noise import (
@@ -28,6 +29,8 @@ from edgeslam_torch.noise import (
 )
 from edgeslam_torch.types import FloatArray, IntArray
 
+_MOST_SIGMA = 0.5
+"""Relative sigma above which evidence is discarded."""
 _LEAST_WEIGHT = 1e-3
 _MIN_EXPLAINED = 0.5
 """Minimum share of the visual path explained by the fit."""
@@ -74,24 +77,29 @@ class Evidence:
         information = self.information - np.outer(column, self.information[_SCALE])
         return replace(self, information=information, vector=self.vector - column * self.vector[_SCALE])
 
+    def solved(self, tilt_sigma_rad: float | FloatArray) -> tuple[float, float] | None:
+        """Scale and relative standard deviation, with the rotation marginalised under its prior."""
+        if not self.information[_SCALE, _SCALE] > 0:
+            return None
+        s = abs(float(self.vector[_SCALE] / self.information[_SCALE, _SCALE]))
+        for _ in range(2):  # the prior on s delta needs s
+            prior = _tilt_prior(max(s, 1e-12), tilt_sigma_rad)
+            try:
+                covariance = np.linalg.inv(self.information + prior)
+            except np.linalg.LinAlgError:
+                return None
+            s = float((covariance @ self.vector)[_SCALE])
+            if not (math.isfinite(s) and s > 1e-9 and covariance[_SCALE, _SCALE] > 0):
+                return None
+        return s, math.sqrt(float(covariance[_SCALE, _SCALE])) / s
 
-def solved(evidence: list[Evidence], tilt_sigma_rad: float | FloatArray) -> tuple[float, float] | None:
-    """Scale and relative standard deviation from all evidence, with the rotation marginalised under its prior."""
-    information = np.sum([e.information for e in evidence], axis=0)
-    vector = np.sum([e.vector for e in evidence], axis=0)
-    if not information[_SCALE, _SCALE] > 0:
-        return None
-    s = abs(float(vector[_SCALE] / information[_SCALE, _SCALE]))
-    for _ in range(2):  # the prior on s delta needs s
-        prior = _tilt_prior(max(s, 1e-12), tilt_sigma_rad)
-        try:
-            covariance = np.linalg.inv(information + prior)
-        except np.linalg.LinAlgError:
+    def belief(self, source: str, tilt_sigma_rad: float | FloatArray, systematic: float) -> ScaleBelief | None:
+        """What it tells of the scale, with a relative systematic error; None where that is hardly anything."""
+        rough = self.solved(tilt_sigma_rad)
+        found = None if rough is None else self.softened(systematic * rough[0]).solved(tilt_sigma_rad)
+        if found is None or found[1] >= _MOST_SIGMA:
             return None
-        s = float((covariance @ vector)[_SCALE])
-        if not (math.isfinite(s) and s > 1e-9 and covariance[_SCALE, _SCALE] > 0):
-            return None
-    return s, math.sqrt(float(covariance[_SCALE, _SCALE])) / s
+        return ScaleBelief(math.log(found[0]), found[1], source)
 
 
 def _tilt_prior(s: float, tilt_sigma_rad: float | FloatArray, offsets: int = 0) -> FloatArray:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.inertial.alignment import Alignment, align
 from edgeslam_torch.estimation.inertial.preintegration import HELD_S, preintegrate
-from edgeslam_torch.estimation.scale.log_scale import LogScale
+from edgeslam_torch.estimation.scale.belief import ScaleBelief
 from edgeslam_torch.geometry.gyroscope_check import checked_against_rotation
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.types import FloatArray
@@ -126,12 +126,12 @@ class Imu:
         return align(stamps_s, T_m_c, readings, self.model, self._mount, before, self._range_ends)
 
     @property
-    def scale(self) -> LogScale | None:
+    def scale(self) -> ScaleBelief | None:
         """Metres per map unit; None while it is not observable."""
         found = self.alignment
         if found is None or found.excitation < _LEAST_EXCITATION or not found.sigma_log_scale < KNOWN_LOG:
             return None
-        return LogScale(found.log_scale, found.sigma_log_scale, "imu")
+        return ScaleBelief(found.log_scale, found.sigma_log_scale, "imu")
 
     @property
     def up(self) -> tuple[FloatArray, float] | None:

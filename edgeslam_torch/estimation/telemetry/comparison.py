@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.config import FusionConfig
-from edgeslam_torch.estimation.scale.log_scale import LogScale
+from edgeslam_torch.estimation.scale.belief import ScaleBelief
 from edgeslam_torch.estimation.telemetry.alignment import Attitudes, apart, attitudes, map_to_world, turns
 from edgeslam_torch.estimation.telemetry.delay import GROWTH, Delay
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
@@ -55,7 +55,7 @@ class FlightSoFar:
     """Camera in the body ``(3, 3)``."""
     rough_scale: float | None
     """Metres per map unit, for what counts as motion."""
-    network: LogScale | None = None
+    network: ScaleBelief | None = None
     """Scale by the depth network, which decides between contradictory velocities and heights."""
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from edgeslam_torch.estimation.config import FusionConfig
-from edgeslam_torch.estimation.scale.joint_scale import displacement_evidence, solved
+from edgeslam_torch.estimation.scale.joint_scale import displacement_evidence
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements
 from edgeslam_torch.noise import VELOCITY_M_S
@@ -77,7 +77,7 @@ def scale_of(
     evidence = displacement_evidence(
         moved.moved @ R_w_m.T, reported, moved.from_s, moved.duration_s, moved.sigma, sigma_m, tilt
     )
-    found = None if evidence is None else solved([evidence], tilt)
+    found = None if evidence is None else evidence.solved(tilt)
     if found is None or found[1] > MOST_SIGMA:
         return None
     return ScaleEstimate(found[0], found[0] * max(found[1], LEAST_SIGMA), "telemetry")

@@ -177,28 +177,6 @@ def _correlation(x: FloatArray, y: FloatArray) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class AtOdds:
-    """Contradictory scales [metres per map unit]."""
-
-    by_velocity: float
-    by_height: float
-    kept: str | None
-    """``telemetry`` (velocities) or ``height``, whichever the depth network supports; None if it supports neither."""
-
-    def warning(self) -> str:
-        """Which sources are rejected."""
-        said = (
-            f"telemetry's velocities and heights contradict each other, {self.by_velocity:.3g} and "
-            f"{self.by_height:.3g} m per map unit"
-        )
-        if self.kept is None:
-            return f"{said}, and neither is used: are the velocities in the right unit?"
-        if self.kept == "height":
-            return f"{said}; the depth network confirms the heights, so the velocities are not used: the wrong unit?"
-        return f"{said}; the depth network confirms the velocities, so the heights are not used"
-
-
-@dataclass(frozen=True, slots=True)
 class Reread:
     """Velocities are interpreted in another frame than configured."""
 
@@ -226,8 +204,6 @@ class SensorGate:
         self.latest: dict[Reading, Agreement] = {}
         self.elsewhere_s: float | None = None
         """Best-fitting video delay if it is outside the allowed range."""
-        self.at_odds: AtOdds | None = None
-        """Contradictory scales of velocities and height, if any."""
         self.tells_scale = True
         """Whether velocities could be fitted to the displacements."""
         self.reread: Reread | None = None
@@ -316,8 +292,6 @@ class SensorGate:
             height = self.latest.get(reading)
             if height is not None and self.verdict(reading) is Verdict.CONTRADICTS:
                 said.append(f"telemetry's height ({reading}) is not used: {_why(height, 'climbing and sinking')}")
-        if self.at_odds is not None:
-            said.append(self.at_odds.warning())
         return said
 
 

@@ -1,0 +1,93 @@
+"""Estimates that contradict each other are not averaged: the less plausible one is dropped and reported."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.estimation.scale.belief import ScaleBelief, contradict, decide, mean
+from edgeslam_torch.types import ScaleEstimate, Units
+
+
+def by(value, sigma, source):
+    return ScaleBelief(math.log(value), sigma, source)
+
+
+@pytest.mark.parametrize(
+    ("beliefs", "used"),
+    [
+        ([], ""),
+        ([by(3.0, 0.02, "telemetry"), by(3.05, 0.05, "height"), by(2.6, 0.15, "depth")], "telemetry+height+depth"),
+        ([by(2.92, 0.02, "telemetry"), by(3.06, 0.04, "height"), by(0.92, 0.15, "depth")], "telemetry+height"),
+        ([by(1.7, 0.02, "telemetry"), by(1.0, 0.16, "depth")], "telemetry"),
+        ([by(10.0, 0.02, "telemetry"), by(1.0, 0.16, "depth")], ""),
+        ([by(10.0, 0.03, "telemetry"), by(1.05, 0.05, "height"), by(1.1, 0.2, "depth")], "height+depth"),
+        ([by(10.0, 0.03, "telemetry"), by(1.05, 0.05, "height"), by(9.0, 0.2, "depth")], "telemetry+depth"),
+        ([by(10.0, 0.03, "telemetry"), by(1.05, 0.05, "height"), by(3.3, 0.1, "depth")], ""),
+        ([by(10.0, 0.03, "telemetry"), by(1.05, 0.05, "height")], ""),
+        ([by(1.15, 0.02, "telemetry"), by(1.0, 0.02, "height")], "telemetry+height"),
+        ([by(1.3, 0.02, "telemetry"), by(1.28, 0.02, "height"), by(1.0, 0.02, "atlas")], "telemetry+height"),
+        ([by(1.0, 0.02, "imu"), by(1.5, 0.02, "telemetry")], "imu"),
+        ([by(1.0, 0.02, "imu"), by(1.02, 0.02, "telemetry"), by(3.0, 0.02, "height")], "imu+telemetry"),
+    ],
+)
+def test_the_largest_group_that_agrees_is_used(beliefs, used):
+    decided = decide(beliefs)
+    assert "+".join(b.source for b in decided.used) == used
+    left_out = {b.source for b in beliefs} - set(used.split("+"))
+    assert decided.rejected == left_out
+    apart = any(contradict(a, b) for a, b in itertools.combinations(beliefs, 2))
+    assert (decided.warning is not None) == apart
+
+
+def test_a_bent_map_explains_two_sensors_but_the_sigma_covers_both():
+    scale = mean(decide([by(1.15, 0.02, "telemetry"), by(1.0, 0.02, "height")]).used)
+    assert scale.sigma >= math.log(1.15)
+
+
+def test_network_out_of_domain_is_unused_but_still_detects_gross_errors():
+    network = by(0.07, 0.6, "depth")
+    assert decide([network], only_witness=True).used == ()
+    right = by(0.2, 0.01, "telemetry")
+    assert decide([right, network], only_witness=True).used == (right,)
+    assert decide([by(2.0, 0.01, "telemetry"), network], only_witness=True).used == ()
+
+
+def test_limits_are_sigmas_of_the_difference():
+    one = ScaleBelief(0.0, 0.03, "telemetry")
+    assert not contradict(one, ScaleBelief(0.148, 0.04, "height"))
+    assert contradict(one, ScaleBelief(-0.152, 0.04, "height"))
+
+
+def test_truth_stays_inside_two_sigmas_when_networks_lie(rng):
+    """One network in five is wrong by up to four times; averaging would drag the scale along in most of these."""
+    inside, averaged, count = 0, 0, 1000
+    for _ in range(count):
+        lie = rng.uniform(-1.4, 1.4) if rng.random() < 0.2 else 0.0
+        sensors = [ScaleBelief(rng.normal(0, 0.05), 0.05, name) for name in ("telemetry", "height")]
+        scale = mean(decide([*sensors, ScaleBelief(lie + rng.normal(0, 0.15), 0.15, "depth")]).used)
+        inside += abs(scale.log_scale) <= 2 * scale.sigma
+        averaged += scale.source.endswith("depth")
+    assert inside / count >= 0.94
+    assert 0.8 < averaged / count < 0.95
+
+
+def test_no_estimate_means_arbitrary_units():
+    assert mean([]) is None
+    assert ScaleEstimate().units is Units.ARBITRARY
+
+
+def test_the_average_is_weighted_with_all_sources_named():
+    fused = mean(
+        [ScaleBelief(0.0, 0.01, "telemetry"), ScaleBelief(0.02, 0.02, "height"), ScaleBelief(0, 0.09, "depth")]
+    )
+    assert fused.log_scale == pytest.approx(0.004, abs=0.001)
+    assert fused.source == "telemetry+height+depth"
+    assert fused.estimate.units is Units.METRES
+    assert fused.sigma < 0.01
+
+
+def test_inconsistent_estimates_widen_sigma():
+    assert mean([ScaleBelief(0.0, 0.01, "telemetry"), ScaleBelief(0.3, 0.01, "height")]).sigma > 0.1
+    assert np.isfinite(mean([ScaleBelief(0.0, 0.01, "imu")]).sigma)
