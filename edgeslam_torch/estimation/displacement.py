@@ -74,6 +74,8 @@ class TelemetryModel:
     """Whether attitude is usable."""
     young: bool = False
     """Whether the map is only seconds old."""
+    gain_sigma: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """Relative standard deviation of each velocity column, beyond that of the scale."""
     standing: bool = False
     """Whether zero readings are usable although velocities are not: zero is independent of the scale."""
 
@@ -108,9 +110,9 @@ class TelemetryModel:
         per_scale_w = sigma * self.scale * p_m @ self.R_w_m.T
         parts = []
         if self.velocity:
-            parts.append(self._displacements(at_s, per_scale_w))
+            parts.append(self._displacements(at_s, p_m, per_scale_w))
         elif self.standing:
-            parts.append(still(self._displacements(at_s, np.zeros_like(per_scale_w)), at_s))
+            parts.append(still(self._displacements(at_s, p_m, np.zeros_like(per_scale_w)), at_s))
         if self.height is not None:
             parts.append(heights(self.track, self.height, at_s, per_scale_w, self.T_b_c[:3, 3], self.delay_sigma_s))
         rows = stacked([part for part in parts if part is not None])
@@ -130,9 +132,10 @@ class TelemetryModel:
             return None
         return headings(self.track, stamps_s - self.delay_s, self.T_b_c[:3, :3], self.R_w_m, self.delay_sigma_s)
 
-    def _displacements(self, at_s: FloatArray, per_scale_w: FloatArray) -> Rows | None:
+    def _displacements(self, at_s: FloatArray, p_m: FloatArray, per_scale_w: FloatArray) -> Rows | None:
         step, arm_b = self.config.velocity_step_m_s, self.T_b_c[:3, 3]
-        return displacements(self.track, at_s, per_scale_w, arm_b, step, self.truncates, self.delay_sigma_s)
+        p_w, gain = self.scale * p_m @ self.R_w_m.T, np.array(self.gain_sigma)
+        return displacements(self.track, at_s, per_scale_w, p_w, gain, arm_b, step, self.truncates, self.delay_sigma_s)
 
     def _gaussian(self, rows: Rows, p_m: FloatArray) -> PositionGaussian:
         """Marginalise, reweight outliers, and rotate to map axes."""

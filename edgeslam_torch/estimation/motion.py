@@ -385,6 +385,7 @@ class MotionFusion:
             heights[0] if scale is not None and heights and "height" not in self.metres.decided.rejected else None,
             self.metres.fit.truncates,
             self._trust.attitude,
+            gain_sigma=self._trust.gain_sigma,
             standing=scale is not None and self.metres.velocity_is_right(self._trust),
         )
 

@@ -50,8 +50,8 @@ _UNDITHERED = 0.05
 """Residual error of the remainders [steps]. With 0.2 to 0.3 steps of noise before rounding, the mean reading is off by
 0.15 to 0.05 steps with a sign that varies with speed; averaging over speeds leaves about two thirds."""
 _UNPROVEN = 15.0
-"""Number of intervals up to which residuals hardly tell rounding modes apart: at similar speeds quantisation errors repeat,
-and the map's own errors may look like either."""
+"""Number of intervals up to which residuals hardly tell rounding modes apart: at similar speeds quantisation errors
+repeat, and the map's own errors may look like either."""
 _GOOD_HEIGHT = 0.2
 """Relative sigma at which the search stops: the remaining height sources observe the same motion less accurately."""
 _HEIGHT_BIN_S = 0.5

@@ -258,6 +258,46 @@ def test_velocities_with_one_wrong_column_tell_no_scale(rng, swinging, replay, a
     assert any("velocities are not used" in w for w in fusion.warnings())
 
 
+def sideways_late(swinging, from_s):
+    """Swung along two axes, along the third only from some time on."""
+    motion = swinging(from_s + 4.0)
+    T, later = motion.T_w_c.copy(), np.maximum(motion.stamps_s - from_s, 0.0)
+    T[:, 1, 3] = 0.3 * np.sin(1.5 * later)
+    return replace(motion, T_w_c=T)
+
+
+def until(motion, end_s):
+    keep = motion.stamps_s < end_s
+    return replace(motion, stamps_s=motion.stamps_s[keep], T_w_c=motion.T_w_c[keep])
+
+
+@pytest.mark.parametrize("change", [np.negative, np.zeros_like], ids=["mirrored", "stuck"])
+def test_motion_along_one_axis_proves_nothing_of_another(rng, swinging, replay, change):
+    """Velocities that agree so far do not pull the map along an axis that has not moved yet."""
+    motion = sideways_late(swinging, 8.0)
+    gauge = motion.in_gauge(rng)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=TelemetryFaults()).samples()
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    replay(fusion, until(motion, 8.3), gauge, column("velocity_m_s", 1, change)(rng, samples, motion))
+    asked = (motion.stamps_s > 7.9) & (motion.stamps_s < 8.75)
+    p = gauge.T_m_c[asked][::4, :3, 3]
+    reported = fusion.telemetry().positions(motion.stamps_s[asked][::4], p)
+    assert fusion.telemetry().velocity
+    chi2 = p.ravel() @ reported.information @ p.ravel() - 2 * reported.vector @ p.ravel() + reported.constant
+    assert chi2 < 4.0 * reported.rows
+
+
+def test_a_column_is_proven_by_motion_along_its_axis(rng, swinging, replay):
+    motion = sideways_late(swinging, 8.0)
+    fusions = []
+    for end_s in (8.0, 12.0):
+        _, fusion, gauge = told_of(rng, replay, until(motion, end_s), lambda rng, samples, motion: samples)
+        fusions.append(fusion.telemetry().gain_sigma)
+        assert abs(math.log(fusion.scale().value / gauge.scale)) < 3.0 * fusion.scale().sigma / fusion.scale().value
+    (_, quiet, _), moved = fusions
+    assert quiet > 1.0 > 0.1 > max(moved)
+
+
 def test_velocities_and_heights_that_contradict_each_other_are_not_surer_than_they_are_apart(rng, swinging, replay):
     def halved(rng, samples, motion):
         return [replace(s, velocity_m_s=0.5 * s.velocity_m_s) for s in samples]

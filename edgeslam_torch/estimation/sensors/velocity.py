@@ -167,6 +167,8 @@ def displacements(
     track: TelemetryTrack,
     at_s: FloatArray,
     per_scale_w: FloatArray,
+    p_w: FloatArray,
+    gain_sigma: FloatArray,
     arm_b: FloatArray,
     step_m_s: float,
     truncates: float,
@@ -178,6 +180,9 @@ def displacements(
         track: Telemetry.
         at_s: Increasing times ``(K,)`` on its clock.
         per_scale_w: Change of the positions per sigma of the scale ``(K, 3)`` [m].
+        p_w: The positions ``(K, 3)`` [m], up to a common one.
+        gain_sigma: Error of each velocity column ``(3,)`` as a share of the motion along it, by telemetry or the map;
+            independent between intervals.
         arm_b: From body to camera ``(3,)``, body axes [m].
         step_m_s: Quantisation step_m_s.
         truncates: Probability that velocities are truncated, not rounded.
@@ -205,7 +210,11 @@ def displacements(
     U = _runs(share, measured.stamp_s[heard], raw, R_w, step_m_s, truncates)
     memory = np.exp(-np.abs(start[:, None] - start[None]) / VELOCITY_BIAS_MEMORY_S)
     bias = VELOCITY_BIAS_M_S**2 * memory * np.outer(L, L)
-    slow = U @ U.T + np.einsum("ij,ab->iajb", bias, np.eye(3)).reshape(3 * N, 3 * N)
+    R_c = track.axes()[np.searchsorted(measured.stamp_s, 0.5 * (start + end))]
+    way = np.linalg.norm([np.einsum("nwa,nw->na", R_c, x) for x in (np.diff(p_w, axis=0)[use], moved)], axis=0)
+    gain = R_c * (gain_sigma * way)[:, None]
+    unproven = np.einsum("iac,ibc,ij->iajb", gain, gain, np.eye(N)).reshape(3 * N, 3 * N)
+    slow = U @ U.T + unproven + np.einsum("ij,ab->iajb", bias, np.eye(3)).reshape(3 * N, 3 * N)
     half = 0.5 * step_m_s * math.sqrt(truncates * (1.0 - truncates))
     speed = track.displacement(at_s + 0.05) - track.displacement(at_s - 0.05)
     delay = min(delay_sigma_s, DELAY_S)

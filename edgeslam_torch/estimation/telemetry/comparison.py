@@ -19,6 +19,7 @@ from edgeslam_torch.estimation.telemetry.sensor_validation import (
     Verdict,
     agreement,
     broken_columns,
+    unproven_columns,
 )
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack, Turn
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, VisualMemory
@@ -135,7 +136,8 @@ class Comparison:
         found = agreement(seen, reported, least_seen, slow, early=True)
         R_w = track.axes()[np.searchsorted(track.readings.stamp_s, 0.5 * (moved.from_s + moved.to_s) - delay_s)]
         seen, reported = (np.einsum("nwa,nw->na", R_w, v) for v in (seen, reported))
-        return replace(found, broken=broken_columns(seen, reported))
+        unproven = unproven_columns(seen, reported)
+        return replace(found, broken=broken_columns(seen, reported, unproven), unproven=unproven)
 
     def _attitude(self, present: FlightSoFar, delay: Delay) -> Agreement | None:
         """Agreement of attitude with the images; None without common intervals."""

@@ -12,6 +12,7 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from edgeslam_torch.estimation.telemetry.track import Turn
 from edgeslam_torch.geometry.robust_statistics import median
@@ -37,6 +38,14 @@ _KEPT = 0.9
 _LEFT_OVER, _LEFT_OVER_M_S = 0.5, 0.06
 """Maximum RMS residual of one velocity column: a share of the speed along its axis, and the truncation error of steps
 of 0.1 m/s [m/s]."""
+_MAP_SHARE = 0.15
+"""Error of displacements of the map over half a second, as a share of them."""
+_USUALLY_RIGHT = math.log(9.0)
+"""Log-odds of a column to be right before any motion along its axis."""
+_SURELY_WRONG = 0.999
+"""Probability at which a column contradicts the images: no single interval reaches it."""
+_WRONG_GAIN = 10.0
+"""Standard deviation of the gain of a column that is frozen or of the wrong sign: it shows nothing."""
 _LARGE_QUANTILE = 0.9
 """Intervals shorter than this share of the length at this quantile count as hover."""
 
@@ -81,6 +90,8 @@ class Agreement:
     """Whether few intervals may validate it."""
     broken: tuple[str, ...] = ()
     """Columns that contradict the images individually: missing motion, frozen, jumping or of the wrong sign."""
+    unproven: tuple[float, ...] = (0.1, 0.1, 0.1)
+    """Probability of each velocity column to be frozen or of the wrong sign."""
 
     @property
     def share(self) -> float:
@@ -133,25 +144,53 @@ def agreement(
     return Agreement(varying, count, dimensions, _correlation(x, y), early)
 
 
-def broken_columns(seen: FloatArray, reported: FloatArray) -> tuple[str, ...]:
+def broken_columns(seen: FloatArray, reported: FloatArray, unproven: tuple[float, ...]) -> tuple[str, ...]:
     """Velocity columns that contradict the images individually.
 
     Args:
         seen: By the images ``(N, 3)`` [map units/s], axes of the columns.
         reported: By telemetry ``(N, 3)`` [m/s].
+        unproven: As `Agreement.unproven`.
 
     Returns:
-        Names of the columns whose residual exceeds the limit at the best scale, without the worst intervals. The mean
-        is included: a frozen velocity differs from the images by it.
+        Names of the columns that are surely frozen or of the wrong sign, or whose residual exceeds the limit at the
+        best scale, without the worst intervals. The mean is included: a frozen velocity differs from the images by it.
     """
+    wrong = np.array(unproven) > _SURELY_WRONG
     if len(seen) < _TO_CONTRADICT:
-        return ()
-    scale = max(float(np.sum(reported * seen)) / max(float(np.sum(seen**2)), 1e-30), 0.0)
+        return tuple(np.array(VELOCITY)[wrong].tolist())
+    scale = _ratio(seen, reported)
     left = np.abs(reported - scale * seen)
     kept = np.sort(left, axis=0)[: int(_KEPT * len(left))]
     speed = np.sqrt(np.maximum(np.mean(reported**2, axis=0), scale**2 * np.mean(seen**2, axis=0)))
     apart = np.sqrt(np.mean(kept**2, axis=0)) > np.maximum(_LEFT_OVER * speed, _LEFT_OVER_M_S)
-    return tuple(name for name, is_apart in zip(VELOCITY, apart.tolist(), strict=True) if is_apart)
+    return tuple(name for name, is_apart in zip(VELOCITY, (apart | wrong).tolist(), strict=True) if is_apart)
+
+
+def unproven_columns(seen: FloatArray, reported: FloatArray) -> tuple[float, ...]:
+    """Probability of each velocity column to be frozen or of the wrong sign, as `Agreement.unproven`.
+
+    Motion along one axis validates the readings as a whole, but shows nothing about the other columns.
+
+    Args:
+        seen: By the images ``(N, 3)`` [map units/s], axes of the columns.
+        reported: By telemetry ``(N, 3)`` [m/s].
+    """
+    if len(seen) == 0:
+        return Agreement.unproven
+    expected = _ratio(seen, reported) * seen
+    variance = _LEFT_OVER_M_S**2 + _MAP_SHARE**2 * np.sum(reported**2, axis=1, keepdims=True)
+    right, mirrored, frozen = (
+        np.sum(np.minimum((reported - x) ** 2 / variance, _WINSOR**2), axis=0)
+        for x in (expected, -expected, reported.mean(axis=0))
+    )
+    log_odds = _USUALLY_RIGHT + 0.5 * (np.minimum(mirrored, frozen) - right)
+    return tuple(expit(-log_odds).tolist())
+
+
+def _ratio(seen: FloatArray, reported: FloatArray) -> float:
+    """Metres per map unit by velocities of both; at least 0."""
+    return max(float(np.sum(reported * seen)) / max(float(np.sum(seen**2)), 1e-30), 0.0)
 
 
 def _moving(x: FloatArray, least: float) -> NDArray[np.bool_]:
@@ -234,6 +273,12 @@ class SensorGate:
         if self.elsewhere_s is not None or self.verdict(Reading.ATTITUDE) is Verdict.CONTRADICTS:
             return False
         return self.verdict(Reading.VELOCITY) is Verdict.AGREES
+
+    @property
+    def gain_sigma(self) -> tuple[float, ...]:
+        """Relative standard deviation of each velocity column."""
+        latest = self.latest.get(Reading.VELOCITY, Agreement())
+        return tuple(_WRONG_GAIN * math.sqrt(share) for share in latest.unproven)
 
     @property
     def attitude(self) -> bool:
