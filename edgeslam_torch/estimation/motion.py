@@ -22,10 +22,7 @@ from edgeslam_torch.estimation.health import disagreement
 from edgeslam_torch.estimation.orientation import Orientation
 from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.estimation.prediction import (
-    VISUAL_REACH_S,
     PoseEstimate,
-    TelemetryPropagation,
-    between,
     by_filter,
     by_vision,
     with_velocity,
@@ -257,7 +254,8 @@ class MotionFusion:
         return self._filter.seen is not None
 
     def predict(self, stamp_s: float) -> PoseEstimate | None:
-        """Camera pose at a frame's stamp from the last visual poses and later telemetry.
+        """Camera pose at a frame's stamp by the filter; at constant velocity while that has no scale or delay, or
+        telemetry has a gap or contradicts the images.
 
         Returns:
             The estimate in map units, or ``None`` before the first tracked frame.
@@ -269,7 +267,7 @@ class MotionFusion:
         if view is not None:
             predicted = by_filter(view, self.scale(), self.flight.delay_sigma_s)
             return with_velocity(predicted, last, previous, self.scale())
-        return self._predict_unfiltered(last, previous, stamp_s)
+        return by_vision(last, previous, stamp_s)
 
     def republished(self, published: OutputFrame, centre_map: FloatArray, keep_scale: bool) -> OutputFrame:
         """The published frame, levelled and, unless ``keep_scale``, with the present scale or guess; the
@@ -321,21 +319,6 @@ class MotionFusion:
         if last is None:
             return None
         return Snapshot(last, self._memory.previous, self._filter.frozen(), self.scale(), self.flight.delay_sigma_s)
-
-    def _predict_unfiltered(self, last: VisualPose, previous: VisualPose | None, stamp_s: float) -> PoseEstimate:
-        """Prediction while the filter has no scale or delay, telemetry has a gap, or contradicts the images."""
-        gap = stamp_s - last.stamp_s
-        visual = by_vision(last, previous, stamp_s)
-        share = 1.0 if previous is None else float(np.clip((gap - VISUAL_REACH_S) / VISUAL_REACH_S, 0.0, 1.0))
-        if share == 0.0 or gap <= 0.0 or not self._trust.motion:
-            return visual
-        propagated = self._propagation().on(last, stamp_s)
-        return visual if propagated is None else between(visual, propagated, share)
-
-    def _propagation(self) -> TelemetryPropagation:
-        T_b_c, R_w_m = self.orientation.T_b_c, self.orientation.R_w_m
-        delay_s, doubt_s = self.delay_s, self.flight.delay_sigma_s
-        return TelemetryPropagation(self._track, delay_s, doubt_s, T_b_c, R_w_m, self.scale(), self.metres.fit)
 
     def statistics(self) -> dict[str, float]:
         """Counters and the state of the estimates, for the report."""

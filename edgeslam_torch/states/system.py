@@ -37,9 +37,6 @@ MIN_GAP_S = 0.15
 """Time between frames from which on the filter predicts the pose for tracking. Telemetry comes every 0.1 s in whole
 degrees: over shorter gaps constant velocity from images is more accurate."""
 
-_BY_SENSORS = ("filter", "telemetry")
-"""Predictions that relate two submaps; constant velocity does not."""
-
 UNKNOWN_SIGMA = 0.01
 """Standard deviation of a visual pose without a covariance [map units, rad]."""
 
@@ -147,13 +144,9 @@ class System:
         return SensorPrior(None if turned is None else Attitude(*turned), place)
 
     def sensor_prediction(self, stamp_s: float) -> PoseEstimate | None:
-        """Pose predicted by the drone's sensors; None without them."""
+        """Pose predicted by the filter; None without it: constant velocity does not relate two submaps."""
         predicted = self.fusion.predict(stamp_s)
-        return (
-            predicted
-            if predicted is not None and predicted.source in _BY_SENSORS and np.isfinite(predicted.sigma_t)
-            else None
-        )
+        return predicted if predicted is not None and predicted.source == "filter" else None
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""

@@ -122,11 +122,6 @@ def test_a_velocity_bias_that_walks_does_not_pull_the_scale(rng):
     assert np.sqrt(np.mean(ratio**2)) < 1.6
 
 
-def test_the_bias_at_the_end_is_reported(rng):
-    bias = np.array([0.05, -0.04, 0.0])
-    np.testing.assert_allclose(displaced(*moved(rng, bias=bias)).bias, bias, atol=0.02)
-
-
 def test_a_rotation_of_the_map_costs_no_scale(rng):
     R = matrix_from_rpy(np.array([0.02, -0.03, 0.05]))
     error, _ = errors(lambda: [displaced(*moved(rng, R=R))], 10)

@@ -563,6 +563,6 @@ def test_lies_that_begin_in_flight_take_the_scale_back(rng, swinging, replay):
 
 
 def test_implausible_telemetry_does_not_carry_the_pose_on(rng, swinging, replay):
-    for spoil, source in ((white, "visual"), (lambda rng, samples, motion: samples, "telemetry")):
-        _, fusion, _ = told_of(rng, replay, swinging(18.0), spoil, tracked=lambda t: t < 14.0)
+    for spoil, source in ((white, "visual"), (lambda rng, samples, motion: samples, "filter")):
+        _, fusion, _ = told_of(rng, replay, swinging(14.5), spoil, tracked=lambda t: t < 14.0)
         assert fusion.predict(14.5).source == source

@@ -61,8 +61,6 @@ class Evidence:
     """``(4,)`` information times mean."""
     rms_m: float
     """RMS residual."""
-    bias: FloatArray
-    """``(3,)`` velocity bias at the end [m/s]; zeros for heights."""
     log_likelihood: float = 0.0
     """Of the displacements, up to a constant, for comparing models of the same data."""
     wander: float = MAP_WANDER_LOG[0]
@@ -177,9 +175,8 @@ def displacement_evidence(
     if fit is None or float(weight.sum()) < MIN_DISPLACEMENTS:
         return None
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(3.0 * float(weight.sum()), 1e-9))
-    bias_m_s = (fit.whitened @ bias)[:, -1] / duration_s[-1]
     torn = float(weight @ np.sum(moved_map**2, axis=1)) < _MIN_EXPLAINED * length
-    evidence = Evidence(fit.information, fit.vector, rms, bias_m_s, fit.log_likelihood, chosen[1], torn)
+    evidence = Evidence(fit.information, fit.vector, rms, fit.log_likelihood, chosen[1], torn)
     covariance = (
         bias + chosen[0] ** 2 * drifting + chosen[1] ** 2 * wandering + np.diag(sigma_m**2 + (s * sigma_map) ** 2)
     )
@@ -264,7 +261,7 @@ def height_evidence(
     information = A[_THETA, _THETA] - A[_THETA, _OFFSETS] @ inner @ A[_OFFSETS, _THETA]
     vector = v[_THETA] - A[_THETA, _OFFSETS] @ inner @ v[_OFFSETS]
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(float(weight.sum()), 1e-9))
-    return Evidence(0.5 * (information + information.T), vector, rms, np.zeros(3))
+    return Evidence(0.5 * (information + information.T), vector, rms)
 
 
 def _unrest(covariance: FloatArray, fit: "_Fit", J: FloatArray, latent: FloatArray, target: FloatArray) -> float:
