@@ -17,7 +17,7 @@ from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.dead_reckoning import REACH_S as RECKONED_S
 from edgeslam_torch.estimation.dead_reckoning import Reckoned, reckoned
 from edgeslam_torch.estimation.displacement import TelemetryModel
-from edgeslam_torch.estimation.filter.filter_feed import FilterFeed, Metric
+from edgeslam_torch.estimation.filter.filter_feed import FilterFeed
 from edgeslam_torch.estimation.health import disagreement
 from edgeslam_torch.estimation.orientation import Orientation
 from edgeslam_torch.estimation.output_frame import OutputFrame
@@ -132,7 +132,7 @@ class MotionFusion:
             self._remember_refined(stamp_s, IMU_REACH_S)
             self._fit_imu()
         if self._trust.velocity and self._trust.motion:
-            self._filter.see(visual, Metric(self.scale(), self.flight.delay.delay))
+            self._filter.see(visual, self.scale(), self.flight.delay.delay)
         else:
             self._filter.clear()
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from edgeslam_torch.estimation.filter.filter_feed import FilterView, FrozenFilter
+from edgeslam_torch.estimation.filter.filter_feed import FilterFeed, FilterView
 from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.estimation.prediction import by_vision
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualPose
@@ -24,7 +24,7 @@ class Snapshot:
     """Newest tracked frame."""
     previous: VisualPose | None
     """The one before, if tracking was not interrupted since."""
-    filter: FrozenFilter | None
+    filter: FilterFeed
     scale: ScaleEstimate
     delay_sigma_s: float
 
@@ -49,17 +49,16 @@ class Present:
         known = self.snapshot
         if known is None:
             return None
-        view = known.filter.view(stamp_s, telemetry) if known.filter is not None else None
+        view = known.filter.at_present(stamp_s, telemetry)
         return self._by_vision(known, stamp_s) if view is None else self._by_filter(known, view)
 
     def _by_filter(self, known: Snapshot, view: FilterView) -> PoseNow:
-        assert known.filter is not None
         unit = self.published.scale / known.scale.value  # published units per metre
         T_w_seen = self.published.pose(view.seen.T)
         T_seen_c = view.T_seen_c.copy()
         T_seen_c[:3, 3] *= unit
         return PoseNow(
-            view.to_s - known.filter.delay.value_s,
+            view.to_s,
             T_w_seen @ T_seen_c,
             unit * (T_w_seen[:3, :3] @ view.velocity_m_s),
             _in_world(_with_doubts(view, known), T_w_seen[:3, :3], unit),

@@ -30,16 +30,6 @@ class PoseSigma:
     r_rad: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Moved:
-    """Motion of the body since the last visual update."""
-
-    from_s: float
-    """Telemetry's stamp of the last visual pose."""
-    to_s: float
-    relative: Relative
-
-
 @dataclass(slots=True)
 class _Event:
     stamp_s: float
@@ -144,16 +134,16 @@ class BufferedEkf:
         self.ekf.restore(present)
         return state
 
-    def since_visual(self, stamp_s: float) -> Moved | None:
-        """Motion of the body from the last visual pose before a stamp to the stamp; ``None`` without one."""
+    def since_visual(self, stamp_s: float) -> tuple[float, Relative] | None:
+        """Stamp of the last visual pose before a stamp, and the motion of the body since; ``None`` without one."""
         event = self._go_to(stamp_s)
         if event is None or not math.isfinite(event.clone_s):
             return None
         present = self.ekf.copy_state()
         velocity = self._advance(event, stamp_s)
-        moved = Moved(event.clone_s, stamp_s, self.ekf.since_clone(velocity))
+        moved = self.ekf.since_clone(velocity)
         self.ekf.restore(present)
-        return moved
+        return event.clone_s, moved
 
     def _go_to(self, stamp_s: float) -> _Event | None:
         """Restore the filter to the last event up to a stamp."""
@@ -282,7 +272,7 @@ class BufferedEkf:
             ekf.clone()
         else:
             ekf.carry_clone(event.T, event.noise.t_m, event.noise.r_rad)
-            outcome = ekf.update_clone(max(event.jitter.t_m, _EXACT), max(event.jitter.r_rad, _EXACT))
+            outcome = ekf.update_relative(np.eye(4), max(event.jitter.t_m, _EXACT), max(event.jitter.r_rad, _EXACT))
             if outcome is Outcome.REFUSED:  # later events may still be accepted
                 ekf.clone()
         event.outcome = self._named("visual", outcome)

@@ -19,8 +19,14 @@ from scipy.linalg.lapack import dposv
 from scipy.special import chdtri  # scipy.stats takes a second of CPU to import
 
 from edgeslam_torch.estimation.config import FusionConfig
-from edgeslam_torch.estimation.filter.relative import relative_measurement
-from edgeslam_torch.geometry.rotations import euler_rate_matrix, matrix_from_rpy, rpy_from_matrix, wrapped
+from edgeslam_torch.geometry.rotations import (
+    euler_rate_matrix,
+    matrix_from_rpy,
+    rotation_vector,
+    rpy_from_matrix,
+    wrapped,
+)
+from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.noise import (
     ATTITUDE_RAD,
     ATTITUDE_WALK_RAD_SQRT_S,
@@ -37,7 +43,6 @@ _SIZE = 15
 _NO_RATE = np.zeros(3)
 _BLIND_S = 0.5
 """Time without vision after which zero readings are taken as hover; longer than a late video's gap."""
-_IDENTITY = np.eye(4)
 
 Saved = tuple[FloatArray, FloatArray, float, dict[int, int]]
 """State, covariance, time since vision, refusals in a row."""
@@ -221,19 +226,16 @@ class Ekf:
         P[_CLONE_P, _CLONE_P] += sigma_t_m**2 * np.eye(3)
         P[_CLONE_A, _CLONE_A] += sigma_r_rad**2 * to_rates.dot(to_rates.T)
 
-    def update_clone(self, sigma_t_m: float, sigma_r_rad: float) -> Outcome:
-        """Constrain the body to the clone, up to the jitter of one visual pose [m], [rad], per axis."""
-        return self.update_relative(_IDENTITY, sigma_t_m, sigma_r_rad)
-
     def update_relative(self, T_clone_b: FloatArray, sigma_t_m: float, sigma_r_rad: float) -> Outcome:
-        """Motion since the clone, measured independently of everything else; the clone is unchanged.
+        """Motion since the clone, which is unchanged; the identity constrains the body to the clone up to the jitter of
+        one visual pose.
 
         Args:
             T_clone_b: Body pose in the cloned body frame [m], shape ``(4, 4)``.
             sigma_t_m: Standard deviation of its translation [m], per axis.
             sigma_r_rad: Standard deviation of its rotation [rad], per axis.
         """
-        residual, H = relative_measurement(self.x, T_clone_b)
+        residual, H = _relative(self.x, T_clone_b)
         P_Ht = self.P.dot(H.T)
         outcome = self._update(P_Ht, H.dot(P_Ht), residual, _pose_noise(sigma_t_m, sigma_r_rad))
         self._after_visual(outcome)
@@ -246,7 +248,7 @@ class Ekf:
             velocity_m_s: Current reading ``(3,)``, in ``config.velocity_frame``.
         """
         x, config = self.x, self.config
-        seen, H = relative_measurement(x, _IDENTITY)
+        seen, H = _relative(x, np.eye(4))
         R_c = matrix_from_rpy(x[_CLONE_A])
         T = np.eye(4)
         T[:3, :3] = R_c.T @ matrix_from_rpy(x[_A])
@@ -314,6 +316,25 @@ class Ekf:
         """Restore what `copy_state` returned."""
         self.x, self.P = np.array(saved[0]), np.array(saved[1])
         self.tau_s, self.refused_in_row = saved[2], dict(saved[3])
+
+
+def _relative(x: FloatArray, T_clone_b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    r"""Innovation of a measured body pose in the cloned body frame ``(4, 4)``, and its derivative.
+
+    .. math:: T_{clone,b} = T_c^{-1} T, \quad h_t = R_c^T (p - p_c), \quad h_R = R_c^T R
+
+    Returns:
+        Measured minus predicted translation [m] and rotation vector [rad] ``(6,)``, and the derivative of the
+        prediction by the state ``(6, 15)``.
+    """
+    R_c, R = matrix_from_rpy(x[_CLONE_A]), matrix_from_rpy(x[_A])
+    moved = R_c.T @ (x[_P] - x[_CLONE_P])
+    clone_rates = R_c.T @ euler_rate_matrix(x[_CLONE_A])  # in body axes
+    H = np.zeros((6, _SIZE))
+    H[:3, _P], H[:3, _CLONE_P], H[:3, _CLONE_A] = R_c.T, -R_c.T, hat(moved) @ clone_rates
+    H[3:, _A], H[3:, _CLONE_A] = R_c.T @ euler_rate_matrix(x[_A]), -clone_rates
+    turned = T_clone_b[:3, :3] @ R.T @ R_c
+    return np.concatenate([T_clone_b[:3, 3] - moved, rotation_vector(turned)]), H
 
 
 def _solved(S: FloatArray, P_Ht: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:

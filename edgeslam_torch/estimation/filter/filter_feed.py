@@ -6,6 +6,7 @@ world. This suffices for predictions in the map, and stays valid when the map is
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,27 +28,13 @@ _DELAY_MOVED_S = 0.003
 
 
 @dataclass(frozen=True, slots=True)
-class Metric:
-    """Conversion of the map's units and clock to the drone's."""
-
-    scale: ScaleEstimate
-    """Metres per map unit."""
-    delay: Delay
-
-    @property
-    def sure(self) -> bool:
-        """Whether increments may enter the filter."""
-        return self.scale.sigma < _SURE * self.scale.value and math.isfinite(self.delay.sigma_s)
-
-
-@dataclass(frozen=True, slots=True)
 class FilterView:
     """The filter's estimate at one stamp, relative to a visual pose of the map."""
 
     seen: VisualPose
     """The last visual pose of the camera."""
     to_s: float
-    """Stamp of the estimate on the frames' clock."""
+    """Stamp of the estimate, on the clock of the one that was asked for."""
     T_seen_c: FloatArray
     """``(4, 4)`` camera, relative to the camera at `seen` [m]."""
     velocity_m_s: FloatArray
@@ -85,22 +72,21 @@ class FilterFeed:
         """Add one state message; non-zero velocities are corrected by a truncation loss of ``shortfall_m_s``."""
         self.ekf.add_telemetry(_corrected(sample, shortfall_m_s))
 
-    def see(self, visual: VisualPose, metric: Metric) -> None:
-        """Update the filter with a tracked frame."""
+    def see(self, visual: VisualPose, scale: ScaleEstimate, delay: Delay) -> None:
+        """Update the filter with a tracked frame, at metres per map unit and the video's delay behind telemetry."""
         seen = self._seen
-        if not metric.sure:
+        if not (scale.sigma < _SURE * scale.value and math.isfinite(delay.sigma_s)):
             self._seen = None
             return
-        moved_clock = self._delay is None or abs(self._delay.value_s - metric.delay.value_s) > _DELAY_MOVED_S
+        moved_clock = self._delay is None or abs(self._delay.value_s - delay.value_s) > _DELAY_MOVED_S
         if moved_clock or self._delay is None:
-            self._delay = metric.delay
+            self._delay = delay
         stamp_s = visual.stamp_s - self._delay.value_s
         self._seen = visual
         if seen is None or moved_clock:
             self._accumulated = None
             self.ekf.see(stamp_s)
             return
-        scale = metric.scale
         T_c = se3.inverse(seen.T) @ visual.T
         T_c[:3, 3] *= scale.value
         T_b = self._T_b_c @ T_c @ se3.inverse(self._T_b_c)
@@ -129,60 +115,40 @@ class FilterFeed:
 
     def view(self, stamp_s: float) -> FilterView | None:
         """The camera at a frame's stamp; ``None`` before the first update, and where telemetry ends too early."""
-        return view(self.ekf, self._seen, self._delay, stamp_s, self._T_b_c, self._config.max_gap_s)
-
-    def frozen(self) -> "FrozenFilter | None":
-        """The filter as it is now, for another thread."""
-        if self._seen is None or self._delay is None:
+        seen, delay = self._seen, self._delay
+        if seen is None or delay is None:
             return None
-        return FrozenFilter(self.ekf.resumed(), self._seen, self._delay, self._T_b_c, self._config.max_gap_s)
+        at_s = stamp_s - delay.value_s
+        if not at_s <= self.ekf.telemetry_s + self._config.max_gap_s:
+            return None
+        since = self.ekf.since_visual(at_s)
+        if since is None or not abs(since[0] + delay.value_s - seen.stamp_s) < _SAME_S:
+            return None
+        T_c_b, moved = se3.inverse(self._T_b_c), since[1]
+        turn = np.kron(np.eye(3), T_c_b[:3, :3])
+        T_seen_c = T_c_b @ moved.T @ self._T_b_c
+        return FilterView(seen, stamp_s, T_seen_c, T_c_b[:3, :3] @ moved.velocity_m_s, turn @ moved.covariance @ turn.T)
 
+    def frozen(self) -> "FilterFeed":
+        """The filter as it is now, for another thread."""
+        other = copy(self)
+        other.ekf = self.ekf.resumed()
+        return other
 
-@dataclass(frozen=True, slots=True)
-class FrozenFilter:
-    """An immutable copy of the filter."""
-
-    ekf: BufferedEkf
-    seen: VisualPose
-    delay: Delay
-    T_b_c: FloatArray
-    max_gap_s: float
-
-    def view(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> FilterView | None:
+    def at_present(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> FilterView | None:
         """The camera on telemetry's clock, at ``stamp_s`` or at the filter's newest event if that is later.
 
         Args:
             stamp_s: Requested time.
-            telemetry: State messages since the copy.
+            telemetry: State messages that the filter does not have yet; it is not changed.
         """
-        ekf = self.ekf.resumed()
+        if self._delay is None:
+            return None
+        other = self.frozen()
         for sample in telemetry:
-            ekf.add_telemetry(sample)
-        at_s = max(stamp_s, ekf.stamp_s or stamp_s) + self.delay.value_s
-        return view(ekf, self.seen, self.delay, at_s, self.T_b_c, self.max_gap_s)
-
-
-def view(
-    ekf: BufferedEkf, seen: VisualPose | None, delay: Delay | None, stamp_s: float, T_b_c: FloatArray, max_gap_s: float
-) -> FilterView | None:
-    """The filter's estimate at a frame's stamp; ``None`` where telemetry ends more than ``max_gap_s`` before."""
-    if seen is None or delay is None:
-        return None
-    at_s = stamp_s - delay.value_s
-    if not at_s <= ekf.telemetry_s + max_gap_s:
-        return None
-    moved = ekf.since_visual(at_s)
-    if moved is None or not abs(moved.from_s + delay.value_s - seen.stamp_s) < _SAME_S:
-        return None
-    T_c_b = se3.inverse(T_b_c)
-    turn = np.kron(np.eye(3), T_c_b[:3, :3])
-    return FilterView(
-        seen,
-        stamp_s,
-        T_c_b @ moved.relative.T @ T_b_c,
-        T_c_b[:3, :3] @ moved.relative.velocity_m_s,
-        turn @ moved.relative.covariance @ turn.T,
-    )
+            other.ekf.add_telemetry(sample)
+        found = other.view(max(stamp_s, other.ekf.stamp_s or stamp_s) + self._delay.value_s)
+        return None if found is None else replace(found, to_s=found.to_s - self._delay.value_s)
 
 
 def _corrected(sample: TelemetrySample, shortfall_m_s: float) -> TelemetrySample:
