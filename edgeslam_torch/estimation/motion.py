@@ -34,10 +34,10 @@ from edgeslam_torch.estimation.sensors.imu import Imu
 from edgeslam_torch.estimation.snapshot import Present, Snapshot
 from edgeslam_torch.estimation.telemetry.comparison import Comparison, FlightSoFar
 from edgeslam_torch.estimation.telemetry.delay import DelaySearch
-from edgeslam_torch.estimation.telemetry.local_scale import drift_in_words, scale_around, scale_of
+from edgeslam_torch.estimation.telemetry.local_scale import AROUND_S, drift_in_words, scale_of
 from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, SensorGate
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
-from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory, VisualPose
+from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, VisualMemory, VisualPose
 from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.noise import VISUAL_SIGMA
@@ -204,28 +204,24 @@ class MotionFusion:
 
     def scale_around(self, stamp_s: float) -> ScaleEstimate | None:
         """Metres per map unit within seconds of an earlier frame, in the present map; None without telemetry."""
-        R_w_m = self._compared_in()
-        if R_w_m is None:
-            return None
-        moved, low = self._memory.displacements(), self.metres.fit.shortfall_m_s
-        T_b_c = self.orientation.T_b_c
-        return scale_around(moved, self._track, stamp_s, self.delay_s, R_w_m, T_b_c, self.config, low)
+        moved = self._memory.displacements()
+        return self._scale_of(moved.only((moved.from_s >= stamp_s - AROUND_S) & (moved.to_s <= stamp_s + AROUND_S)))
 
     def scale_along(self, stamps_s: FloatArray, T_w_c: FloatArray) -> ScaleEstimate | None:
         """Metres per map unit along some frames of the flight, ``(F,)`` and ``(F, 4, 4)``; None without telemetry."""
-        R_w_m = self._compared_in()
-        if R_w_m is None or len(stamps_s) == 0:
+        if len(stamps_s) == 0:
             return None
         length_s = float(stamps_s[-1] - stamps_s[0]) + self.config.window_s
         memory = VisualMemory(self.config.interval_s, length_s, self.config.max_gap_s)
         for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
             memory.add(VisualPose(stamp_s, T, VISUAL_SIGMA, VISUAL_SIGMA))
-        low, T_b_c = self.metres.fit.shortfall_m_s, self.orientation.T_b_c
-        return scale_of(memory.displacements(), self._track, self.delay_s, R_w_m, T_b_c, self.config, low)
+        return self._scale_of(memory.displacements())
 
-    def _compared_in(self) -> FloatArray | None:
-        """``R_w_m`` if velocities may determine a scale."""
-        return self.orientation.R_w_m if self._trust.velocity and len(self._track) > 0 else None
+    def _scale_of(self, moved: Displacements) -> ScaleEstimate | None:
+        R_w_m, low = self.orientation.R_w_m, self.metres.fit.shortfall_m_s
+        if R_w_m is None or not self._trust.velocity or len(self._track) == 0:
+            return None
+        return scale_of(moved, self._track, self.delay_s, R_w_m, self.orientation.T_b_c, self.config, low)
 
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
         """As `Orientation.vertical`; None if the map did not begin upright, or has a metric scale: attitude in whole

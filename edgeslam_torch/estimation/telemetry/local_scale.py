@@ -6,6 +6,7 @@ scale, so that two places in it may differ; local velocities measure the differe
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,32 +28,6 @@ _SIGMAS, _SAID_LOG = 3.0, math.log(1.15)
 distortion."""
 
 
-def scale_around(
-    moved: Displacements,
-    track: TelemetryTrack,
-    stamp_s: float,
-    delay_s: float,
-    R_w_m: FloatArray,
-    T_b_c: FloatArray,
-    config: FusionConfig,
-    shortfall_m_s: float = 0.0,
-) -> ScaleEstimate | None:
-    """Metres per map unit within `AROUND_S` of a moment; None where velocities do not determine it.
-
-    Args:
-        moved: Visual displacements of the flight, by the stamps of frames.
-        track: Telemetry of the flight.
-        stamp_s: The moment, by the stamps of frames.
-        delay_s: Video delay behind telemetry.
-        R_w_m: Map axes to telemetry's world ``(3, 3)``.
-        T_b_c: Camera to body ``(4, 4)`` [m].
-        config: Noise of velocities, and the minimum speed.
-        shortfall_m_s: Expected truncation loss of every non-zero velocity.
-    """
-    near = (moved.from_s >= stamp_s - AROUND_S) & (moved.to_s <= stamp_s + AROUND_S)
-    return scale_of(moved.only(near), track, delay_s, R_w_m, T_b_c, config, shortfall_m_s)
-
-
 def scale_of(
     moved: Displacements,
     track: TelemetryTrack,
@@ -60,9 +35,19 @@ def scale_of(
     R_w_m: FloatArray,
     T_b_c: FloatArray,
     config: FusionConfig,
-    shortfall_m_s: float,
+    shortfall_m_s: float = 0.0,
 ) -> ScaleEstimate | None:
-    """Metres per map unit along some displacements; arguments as for `scale_around`."""
+    """Metres per map unit along some displacements; None where velocities do not determine it.
+
+    Args:
+        moved: Visual displacements, by the stamps of frames.
+        track: Telemetry of the flight.
+        delay_s: Video delay behind telemetry.
+        R_w_m: Map axes to telemetry's world ``(3, 3)``.
+        T_b_c: Camera to body ``(4, 4)`` [m].
+        config: Noise of velocities, and the minimum speed.
+        shortfall_m_s: Expected truncation loss of every non-zero velocity.
+    """
     moved = moved.on_telemetry_clock(delay_s)
     moved = moved.only(track.covered(moved.from_s, moved.to_s))
     if not len(moved):
@@ -77,10 +62,10 @@ def scale_of(
     evidence = displacement_evidence(
         moved.moved @ R_w_m.T, reported, moved.from_s, moved.duration_s, moved.sigma, sigma_m, tilt
     )
-    found = None if evidence is None else evidence.solved(tilt)
-    if found is None or found[1] > MOST_SIGMA:
+    found = None if evidence is None else evidence.belief("telemetry", tilt, 0.0)
+    if found is None or found.sigma > MOST_SIGMA:
         return None
-    return ScaleEstimate(found[0], found[0] * max(found[1], LEAST_SIGMA), "telemetry")
+    return replace(found, sigma=max(found.sigma, LEAST_SIGMA)).estimate
 
 
 def drift_in_words(scale_at: Callable[[float], ScaleEstimate | None], from_s: float, to_s: float) -> str | None:

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from itertools import islice, takewhile
 
@@ -38,15 +38,6 @@ class VisualPose:
         """The refined pose of this frame, if there is one."""
         T = known.get(self.stamp_s)
         return self if T is None else replace(self, T=T)
-
-
-@dataclass(frozen=True, slots=True)
-class _Interval:
-    start: VisualPose
-    end: VisualPose
-
-    def each(self, change: Callable[[VisualPose], VisualPose]) -> "_Interval":
-        return _Interval(change(self.start), change(self.end))
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +117,10 @@ class VisualMemory:
 
     def __init__(self, interval_s: float, window_s: float, max_gap_s: float) -> None:
         self._interval_s, self._max_gap_s = interval_s, max_gap_s
-        self._intervals: deque[_Interval] = deque(maxlen=max(20, int(window_s / interval_s)))
         self._sightings: deque[VisualPose] = deque(maxlen=int(10 * window_s))
-        self._start: VisualPose | None = None
-        """Start of the current displacement."""
+        self._unbroken: deque[bool] = deque(maxlen=int(10 * window_s))
+        """Whether tracking has not been interrupted between each pose and the one before."""
+        self._interrupted = True
         self.began_s = math.inf
         """Stamp of the first tracked frame."""
         self.last: VisualPose | None = None
@@ -145,44 +136,33 @@ class VisualMemory:
         self.began_s = min(self.began_s, visual.stamp_s)
         gap = last is None or visual.stamp_s - last.stamp_s > self._max_gap_s
         self.previous, self.last = None if gap else last, visual
+        self._interrupted |= gap
         if not self._sightings or visual.stamp_s - self._sightings[-1].stamp_s > _SIGHTING_S:
             self._sightings.append(visual)
-            self._shown = None
-        start = None if gap else self._start
-        if start is None:
-            self._start = visual
-        elif visual.stamp_s - start.stamp_s >= self._interval_s - 1e-3:
-            self._intervals.append(_Interval(start, visual))
-            self._start = visual
-            self._displacements = None
+            self._unbroken.append(not self._interrupted)
+            self._interrupted = False
+            self._shown = self._displacements = None
 
     def interrupt(self) -> None:
         """End the current displacement: tracking was lost."""
-        self._start = self.previous = None
+        self._interrupted, self.previous = True, None
 
     def revise(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
         """Replace poses by refined ones ``(F, 4, 4)`` with stamps ``(F,)``; others are unchanged."""
         known = dict(zip(stamps_s.tolist(), T_w_c, strict=True))
-        self._each(lambda visual: visual.revised(known))
+        self._sightings = deque((v.revised(known) for v in self._sightings), self._sightings.maxlen)
+        self.last, self.previous = (None if v is None else v.revised(known) for v in (self.last, self.previous))
+        self._shown = self._displacements = None
 
     def move_newest(self, T: FloatArray) -> None:
         """Transform the newest poses with the map around them: ``T_w_c' = T T_w_c``, ``(4, 4)``; older ones are
         unchanged."""
         self.last, self.previous = (None if v is None else v.moved(T) for v in (self.last, self.previous))
 
-    def _each(self, change: Callable[[VisualPose], VisualPose]) -> None:
-        self._intervals = deque((i.each(change) for i in self._intervals), self._intervals.maxlen)
-        self._sightings = deque(map(change, self._sightings), self._sightings.maxlen)
-        self._shown = None
-        self._start, self.last, self.previous = (
-            None if visual is None else change(visual) for visual in (self._start, self.last, self.previous)
-        )
-        self._displacements = None
-
     @property
     def count(self) -> int:
         """Number of displacements."""
-        return len(self._intervals)
+        return len(self.displacements())
 
     @property
     def length_s(self) -> float:
@@ -192,16 +172,18 @@ class VisualMemory:
     def displacements(self) -> Displacements:
         """All displacements as arrays."""
         if self._displacements is None:
-            starts, ends = ([getattr(i, which) for i in self._intervals] for which in ("start", "end"))
-            T_from, T_to = (np.array([v.T for v in poses]).reshape(-1, 4, 4) for poses in (starts, ends))
-            self._displacements = Displacements(
-                np.array([v.stamp_s for v in starts]),
-                np.array([v.stamp_s for v in ends]),
-                T_to[:, :3, 3] - T_from[:, :3, 3],
-                np.array([math.hypot(a.sigma_t, b.sigma_t) for a, b in zip(starts, ends, strict=True)]),
-                T_from[:, :3, :3],
-                T_to[:, :3, :3],
-            )
+            seen, ends = self.sightings(), []
+            begin, stamps_s = 0, seen.stamps_s.tolist()
+            for k, unbroken in enumerate(self._unbroken):
+                if not unbroken:
+                    begin = k
+                elif stamps_s[k] - stamps_s[begin] >= self._interval_s - 1e-3:
+                    ends.append((begin, k))
+                    begin = k
+            i, j = np.array(ends, dtype=np.int64).reshape(-1, 2).T
+            moved, sigma = seen.T[j, :3, 3] - seen.T[i, :3, 3], np.hypot(seen.sigma_t[i], seen.sigma_t[j])
+            R = seen.T[:, :3, :3]
+            self._displacements = Displacements(seen.stamps_s[i], seen.stamps_s[j], moved, sigma, R[i], R[j])
         return self._displacements
 
     def recent(self, since_s: float) -> Sightings | None:
