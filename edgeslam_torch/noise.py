@@ -103,9 +103,6 @@ DEPTH_SCALE_LOG = 0.1
 
 # --- motion -----------------------------------------------------------------------------------------------------------
 
-ACCELERATION_M_S2 = 1.0
-ANGULAR_ACCELERATION_RAD_S2 = 1.0
-"""Of a hand or a small drone: constant velocity is off by 20 mm and 20 mrad after 0.2 s."""
 IMPLAUSIBLE_ACCELERATION_M_S2 = 10.0
 """Per axis, 1 g: a prior that is weak against images; hands and drones have 0.2 to 1.7."""
 FAST_M_S = 1e3

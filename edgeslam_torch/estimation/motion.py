@@ -25,7 +25,6 @@ from edgeslam_torch.estimation.prediction import (
     PoseEstimate,
     by_filter,
     by_vision,
-    with_velocity,
 )
 from edgeslam_torch.estimation.remembered import Remembered
 from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
@@ -261,8 +260,7 @@ class MotionFusion:
             return None
         view = self._filter.view(stamp_s) if stamp_s > last.stamp_s else None
         if view is not None:
-            predicted = by_filter(view, self.scale(), self.flight.delay_sigma_s)
-            return with_velocity(predicted, last, previous, self.scale())
+            return by_filter(view, self.scale(), self.flight.delay_sigma_s)
         return by_vision(last, previous, stamp_s)
 
     def republished(self, published: OutputFrame, centre_map: FloatArray, keep_scale: bool) -> OutputFrame:

@@ -8,7 +8,7 @@ import numpy as np
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.scale.belief import ScaleBelief, contradict
 from edgeslam_torch.estimation.scale.camera_mount import Turned
-from edgeslam_torch.estimation.scale.joint_scale import (
+from edgeslam_torch.estimation.scale.evidence import (
     MIN_DISPLACEMENTS,
     Evidence,
     aged_since,

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from edgeslam_torch.estimation.config import FusionConfig
-from edgeslam_torch.estimation.scale.joint_scale import displacement_evidence
+from edgeslam_torch.estimation.scale.evidence import displacement_evidence
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements
 from edgeslam_torch.noise import VELOCITY_M_S

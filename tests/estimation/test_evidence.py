@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from edgeslam_torch.estimation.scale.joint_scale import (
+from edgeslam_torch.estimation.scale.evidence import (
     aged_since,
     displacement_evidence,
     height_evidence,

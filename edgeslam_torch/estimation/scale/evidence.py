@@ -1,7 +1,7 @@
-r"""Metric scale from velocity and height together, in a map whose scale may wander as much as the residuals say.
+r"""Metric scale from velocities or heights, in a map whose scale may wander as much as the residuals say.
 
 Unknowns are :math:`\theta = (s, s\,\delta)`: metres per map unit and a small rotation of the map against the drone's
-world. Both kinds of measurement are linear in them, so each gives information on :math:`\theta` and the two add up:
+world. Both kinds of measurement are linear in them:
 
 .. math::
     d_i = s\,u_i + s\,\delta \times u_i + b_i L_i + \epsilon_i, \qquad
