@@ -33,11 +33,10 @@ from edgeslam_torch.estimation.sensors.imu import Imu
 from edgeslam_torch.estimation.snapshot import Present, Snapshot
 from edgeslam_torch.estimation.telemetry.comparison import Comparison, FlightSoFar
 from edgeslam_torch.estimation.telemetry.delay import DelaySearch
-from edgeslam_torch.estimation.telemetry.local_scale import AROUND_S, drift_in_words, scale_of
 from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, SensorGate
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, VisualMemory, VisualPose
-from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
+from edgeslam_torch.estimation.telemetry_scale import AROUND_S, TelemetryScale, drift_in_words, scale_of
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.noise import VISUAL_SIGMA
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample

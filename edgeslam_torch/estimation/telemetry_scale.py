@@ -1,7 +1,11 @@
-"""Metric scale from the drone's velocities and heights, each alone and combined."""
+"""Metric scale from the drone's velocities and heights: of the present map, and around one moment of the flight.
+
+A monocular map drifts in scale, so that two places in it may differ; local velocities measure the difference.
+"""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +27,7 @@ from edgeslam_torch.estimation.sensors.velocity import (
     remainder_gain,
     seen_velocity,
 )
+from edgeslam_torch.estimation.telemetry.alignment import camera_moved, in_common
 from edgeslam_torch.estimation.telemetry.comparison import FlightSoFar
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
     Reading,
@@ -30,6 +35,7 @@ from edgeslam_torch.estimation.telemetry.sensor_validation import (
     agreement,
     changes,
 )
+from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements
 from edgeslam_torch.noise import (
     HEIGHT_M,
@@ -40,7 +46,7 @@ from edgeslam_torch.noise import (
     VELOCITY_SCALE_LOG,
     VELOCITY_TRUNCATED_SCALE_LOG,
 )
-from edgeslam_torch.types import FloatArray, IntArray
+from edgeslam_torch.types import FloatArray, IntArray, ScaleEstimate
 
 _MOST_ROUNDS = 5
 _SETTLED = 0.003
@@ -65,6 +71,15 @@ _LEAST_CHANGES = 2
 or of the map dominates the slope."""
 _MOST_STEPS = 0.3
 """Maximum share of height readings classified as floor steps; furniture causes fewer."""
+AROUND_S = 5.0
+"""Time before and after the moment: four metres each at an indoor drone's speed."""
+_MOST_LOCAL_SIGMA = 0.15
+"""Maximum relative standard deviation of a local scale."""
+_LEAST_LOCAL_SIGMA = 0.03
+"""Lower bound of the standard deviation: drift within the window."""
+_SIGMAS, _SAID_LOG = 3.0, math.log(1.15)
+"""Minimum significance and size of a reported difference: above the effect of quantised velocities and map
+distortion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,15 +268,10 @@ class TelemetryScale:
         """Intervals in which the drone moves."""
         track, config, memory = self._present.track, self._config, self._present.memory
         moved = memory.displacements()
-        if len(moved) == 0:
+        moved = in_common(moved, track, self._delay_s).joined()
+        if len(moved) < 2:
             return None
-        use = track.covered(moved.from_s - self._delay_s, moved.to_s - self._delay_s)
-        if use.sum() < 2:
-            return None
-        moved = moved.only(use).joined().on_telemetry_clock(self._delay_s)
-        R_from, R_to = track.attitude(moved.from_s), track.attitude(moved.to_s)
-        reported = track.displacement(np.concatenate([moved.from_s, moved.to_s]))
-        moved_m = reported[len(moved) :] - reported[: len(moved)] + (R_to - R_from) @ self._T_b_c[:3, 3]
+        moved_m = camera_moved(moved, track, self._T_b_c[:3, 3])
         moving = self._moving(moved, moved_m)
         if moving.sum() < 2:
             return None
@@ -337,3 +347,67 @@ class TelemetryScale:
         least = max(_LEAST_CLIMB_M, _LEAST_CLIMB_SIGMAS * HEIGHT_M[reading])
         seen, reported = (changes(z, stamps_s, segment, _HEIGHT_BIN_S) for z in (z_map, z_m))
         self._trust.judge(reading, agreement(seen, reported, least / scale, least))
+
+
+def scale_of(
+    moved: Displacements,
+    track: TelemetryTrack,
+    delay_s: float,
+    R_w_m: FloatArray,
+    T_b_c: FloatArray,
+    config: FusionConfig,
+    shortfall_m_s: float = 0.0,
+) -> ScaleEstimate | None:
+    """Metres per map unit along some displacements; None where velocities do not determine it.
+
+    Args:
+        moved: Visual displacements, by the stamps of frames.
+        track: Telemetry of the flight.
+        delay_s: Video delay behind telemetry.
+        R_w_m: Map axes to telemetry's world ``(3, 3)``.
+        T_b_c: Camera to body ``(4, 4)`` [m].
+        config: Noise of velocities, and the minimum speed.
+        shortfall_m_s: Expected truncation loss of every non-zero velocity.
+    """
+    moved = in_common(moved, track, delay_s)
+    if not len(moved):
+        return None
+    reported = camera_moved(moved, track, T_b_c[:3, 3], shortfall_m_s)
+    moving = np.linalg.norm(reported, axis=1) > config.min_speed_m_s * moved.duration_s
+    moved, reported = moved.only(moving), reported[moving]
+    sigma_m = VELOCITY_M_S * np.sqrt(0.1 * moved.duration_s)
+    tilt = config.alignment_sigma_rad
+    evidence = displacement_evidence(
+        moved.moved @ R_w_m.T, reported, moved.from_s, moved.duration_s, moved.sigma, sigma_m, tilt
+    )
+    found = None if evidence is None else evidence.belief("telemetry", tilt, 0.0)
+    if found is None or found.sigma > _MOST_LOCAL_SIGMA:
+        return None
+    return replace(found, sigma=max(found.sigma, _LEAST_LOCAL_SIGMA)).estimate
+
+
+def drift_in_words(scale_at: Callable[[float], ScaleEstimate | None], from_s: float, to_s: float) -> str | None:
+    """Warning that an earlier part of the map differs significantly in scale from the present one; None otherwise.
+
+    Args:
+        scale_at: Metres per map unit around a moment.
+        from_s: Oldest stored moment.
+        to_s: The present.
+    """
+    now = scale_at(to_s - AROUND_S)
+    if now is None:
+        return None
+    most, said = _SAID_LOG, None
+    for moment_s in np.arange(from_s + AROUND_S, to_s - 3.0 * AROUND_S, 2.0 * AROUND_S).tolist():
+        then = scale_at(moment_s)
+        if then is None:
+            continue
+        gap = abs(math.log(now.value / then.value))
+        if gap > most and gap > _SIGMAS * math.hypot(now.sigma / now.value, then.sigma / then.value):
+            most = gap
+            said = (
+                f"the map's scale has drifted: by telemetry {then.value:.3g} metres per map unit "
+                f"{to_s - moment_s:.0f} s ago and {now.value:.3g} now; distances there are off by "
+                f"{100 * math.expm1(gap):.0f} %"
+            )
+    return said

@@ -100,6 +100,28 @@ def map_to_world(sightings: Sightings, track: TelemetryTrack, delay_s: float, R_
     return None if reported is None else reported.map_to_world(R_b_c)
 
 
+def in_common(moved: Displacements, track: TelemetryTrack, delay_s: float) -> Displacements:
+    """The displacements that telemetry covers, on its clock."""
+    moved = moved.on_telemetry_clock(delay_s)
+    return moved.only(track.covered(moved.from_s, moved.to_s))
+
+
+def camera_moved(
+    moved: Displacements, track: TelemetryTrack, arm_b: FloatArray, shortfall_m_s: float = 0.0
+) -> FloatArray:
+    """Displacements ``(N, 3)`` of the camera by telemetry [m], over intervals on its clock.
+
+    Args:
+        moved: The intervals.
+        track: Telemetry.
+        arm_b: From body to camera ``(3,)``, body axes [m].
+        shortfall_m_s: As for `TelemetryTrack.displacement`.
+    """
+    path = track.displacement(np.concatenate([moved.from_s, moved.to_s]), shortfall_m_s)
+    turned = track.attitude(moved.to_s) - track.attitude(moved.from_s)
+    return np.asarray(path[len(moved) :] - path[: len(moved)] + turned @ arm_b)
+
+
 def turns(moved: Displacements, track: TelemetryTrack, R_b_c: FloatArray) -> Turns:
     """Rotations over each interval according to images and telemetry.
 

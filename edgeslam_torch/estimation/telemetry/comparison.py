@@ -8,7 +8,15 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.scale.belief import ScaleBelief
-from edgeslam_torch.estimation.telemetry.alignment import Attitudes, apart, attitudes, map_to_world, turns
+from edgeslam_torch.estimation.telemetry.alignment import (
+    Attitudes,
+    apart,
+    attitudes,
+    camera_moved,
+    in_common,
+    map_to_world,
+    turns,
+)
 from edgeslam_torch.estimation.telemetry.delay import GROWTH, Delay
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
     ATTITUDE,
@@ -22,7 +30,7 @@ from edgeslam_torch.estimation.telemetry.sensor_validation import (
     unproven_columns,
 )
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack, Turn
-from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, VisualMemory
+from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory
 from edgeslam_torch.types import FloatArray
 
 _WIDE_DELAYS_S = (-3.0, 3.0)
@@ -125,26 +133,27 @@ class Comparison:
 
         The camera's lever arm is left out: rotations must not count as evidence for velocities.
         """
-        track, moved = present.track, _in_common(present, delay_s)
+        track = present.track
+        moved = in_common(present.memory.displacements(), track, delay_s)
         if len(moved) == 0:
             return Agreement()
         duration = moved.duration_s[:, None]
-        reported = track.displacement(moved.to_s - delay_s) - track.displacement(moved.from_s - delay_s)
+        reported = camera_moved(moved, track, np.zeros(3))
         slow = self._config.min_speed_m_s
         least_seen = math.inf if present.rough_scale is None else 2.0 * slow / present.rough_scale
         seen, reported = moved.moved @ R_w_m.T / duration, reported / duration
         found = agreement(seen, reported, least_seen, slow, early=True)
-        R_w = track.axes()[np.searchsorted(track.readings.stamp_s, 0.5 * (moved.from_s + moved.to_s) - delay_s)]
+        R_w = track.axes()[np.searchsorted(track.readings.stamp_s, 0.5 * (moved.from_s + moved.to_s))]
         seen, reported = (np.einsum("nwa,nw->na", R_w, v) for v in (seen, reported))
         unproven = unproven_columns(seen, reported)
         return replace(found, broken=broken_columns(seen, reported, unproven), unproven=unproven)
 
     def _attitude(self, present: FlightSoFar, delay: Delay) -> Agreement | None:
         """Agreement of attitude with the images; None without common intervals."""
-        moved = _in_common(present, delay.value_s)
+        moved = in_common(present.memory.displacements(), present.track, delay.value_s)
         if len(moved) == 0:
             return None
-        both = turns(moved.on_telemetry_clock(delay.value_s), present.track, present.R_b_c)
+        both = turns(moved, present.track, present.R_b_c)
         seen, reported = (
             Rotation.from_matrix(R).as_rotvec() / moved.duration_s[:, None] for R in (both.seen, both.reported)
         )
@@ -172,12 +181,6 @@ class Comparison:
         share = np.clip(_APART_SHARE * found.seen, _APART_RAD, MOST_APART_RAD)
         late = delay_sigma_s * found.rate
         return np.maximum(found.apart / np.hypot(share, late), found.lately / np.hypot(MOST_APART_RAD, 2.0 * late))
-
-
-def _in_common(present: FlightSoFar, delay_s: float) -> Displacements:
-    """Displacements that telemetry covers, on the video's clock."""
-    moved = present.memory.displacements()
-    return moved.only(present.track.covered(moved.from_s - delay_s, moved.to_s - delay_s))
 
 
 def _surely_better(best: Agreement, now: Agreement) -> bool:
