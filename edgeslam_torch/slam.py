@@ -268,7 +268,8 @@ class EdgeSlam:
         """Predicted pose at a time after the newest frame; callable from any thread while frames are processed.
 
         With telemetry the video's delay is compensated: the frame stamped ``t`` shows the world at ``t - delay``, and
-        telemetry received since propagates the pose to the present.
+        telemetry received since propagates the pose to the present. Without telemetry it is constant velocity, with the
+        rotation of an IMU's gyroscope up to ``stamp_s`` if readings reach that far.
 
         Args:
             stamp_s: Time [s] on the clock of frames and telemetry.
@@ -277,7 +278,7 @@ class EdgeSlam:
         Returns:
             The pose in the world of `SlamOutput.T_w_c`; ``None`` before the first frame with a pose.
         """
-        return self._present.pose_at(stamp_s, separated(readings)[0])
+        return self._present.pose_at(stamp_s, *separated(readings))
 
     def _step(self, frame: Frame, seen: LazyView) -> Step:
         """Process a frame in the current state."""

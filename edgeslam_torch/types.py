@@ -409,7 +409,7 @@ class PoseNow(Record):
     itself is off is not in it."""
     source: str
     """``filter``: Kalman filter, the video's delay is made up for. ``visual``: constant velocity from the last frames,
-    as if the video were not late."""
+    as if the video were not late. ``visual+imu``: the same, with the rotation of a gyroscope."""
     seen_s: float
     """Stamp of the last frame whose place in the map is known."""
     metric: bool

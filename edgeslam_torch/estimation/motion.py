@@ -311,7 +311,8 @@ class MotionFusion:
         last = self._memory.last
         if last is None:
             return None
-        return Snapshot(last, self._memory.previous, self._filter.frozen(), self.scale(), self.flight.delay_sigma_s)
+        held = self._filter.frozen(), self.imu.frozen()
+        return Snapshot(last, self._memory.previous, *held, self.scale(), self.flight.delay_sigma_s)
 
     def statistics(self) -> dict[str, float]:
         """Counters and the state of the estimates, for the report."""

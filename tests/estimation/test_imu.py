@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.estimation.sensors.imu import Imu
+from edgeslam_torch.estimation.snapshot import Present
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.noise import VISUAL_MEMORY_S
 from edgeslam_torch.synthetic.flights.imu import ADIS16448, MPU6050, mounted, simulate_imu
@@ -181,6 +184,23 @@ def test_rotation_between_frames() -> None:
     assert R_c_c is not None
     visual = seen.T_m_c[-1, :3, :3].T @ seen.T_m_c[-3, :3, :3]
     assert Rotation.from_matrix(R_c_c.T @ visual).magnitude() < 0.005
+
+
+def test_the_pose_between_frames_turns_with_the_gyroscope() -> None:
+    """A third of a second after the last frame, with readings that came since and without."""
+    model = mounted(ADIS16448, T_IMU_CAM)
+    seen = flight("free", model, 0)
+    last_s, now_s = seen.stamps_s[-4], float(seen.stamps_s[-1])
+    fusion = MotionFusion(FusionConfig(), np.eye(4), imu=model)
+    fusion.add_imu([seen.readings.between(-np.inf, last_s)])
+    for stamp_s, T in zip(seen.stamps_s[:-3].tolist(), seen.T_m_c[:-3], strict=True):
+        fusion.add_visual(stamp_s, T, 0.01, 0.001)
+    present = Present(fusion.snapshot())
+    felt = present.pose_at(now_s, (), [seen.readings.between(last_s, now_s)])
+    guessed = present.pose_at(now_s)
+    off = [Rotation.from_matrix(p.T_w_c[:3, :3].T @ seen.T_m_c[-1, :3, :3]).magnitude() for p in (felt, guessed)]
+    assert (felt.source, guessed.source) == ("visual+imu", "visual")
+    assert off[0] < 0.005 < 5 * off[0] < off[1]
 
 
 def test_the_reading_of_a_frame_may_come_with_the_next() -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -30,6 +31,8 @@ _CONTRADICTED_SHARE, _CONTRADICTED_M = 0.05, 0.03
 """The same for visual positions, of the extent of the way and in metres; in flight 0.01 and 0.01 to 0.02 m."""
 _UPRIGHT_RAD = math.radians(1.0)
 """Maximum standard deviation of a vertical that levels the output."""
+_RECENT = 30
+"""Number of parts, one a frame, of a copy for a prediction: a second."""
 _OFFSET_RANGE_S, _OFFSET_STEP_S = 0.5, 0.005
 _LEAST_RATE_RAD_S = 0.05
 """Minimum standard deviation of the angular rate about a second axis, from which on it determines a mount: five times
@@ -65,7 +68,7 @@ class Imu:
 
     def add(self, parts: Sequence[ImuReadings]) -> None:
         """Readings in temporal order."""
-        self.forces += [part for part in parts if not part.has_gyroscope]
+        self.forces = self.forces + [part for part in parts if not part.has_gyroscope]
         self._parts += [part for part in parts if len(part) and part.has_gyroscope]
 
     def begin_submap(self, stamp_s: float) -> None:
@@ -156,6 +159,13 @@ class Imu:
         moments = np.array([from_s, to_s]) + found.offset_s
         felt = preintegrate(readings, moments, found.bias[-1], self.model, self._range_ends)
         return found.R_i_c.T @ felt.R[0].T @ found.R_i_c if felt.complete[0] else None
+
+    def frozen(self, readings: Sequence[ImuReadings] = ()) -> "Imu":
+        """A copy for another thread, of the newest readings and of some since then."""
+        other = copy(self)
+        other._parts = self._parts[-_RECENT:]
+        other.add(readings)
+        return other
 
     def _between(self, after_s: float, until_s: float) -> ImuReadings:
         """Readings of a time."""
