@@ -1,6 +1,5 @@
 """Prediction of the camera pose without an image: by the Kalman filter, or at constant velocity without it."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,11 +34,7 @@ def by_filter(view: FilterView, scale: ScaleEstimate, delay_sigma_s: float) -> P
     """The filter's prediction in the map's units."""
     T = view.T_seen_c.copy()
     T[:3, 3] /= scale.value
-    way = float(np.linalg.norm(view.T_seen_c[:3, 3])) * scale.sigma / scale.value
-    late = float(np.linalg.norm(view.velocity_m_s)) * delay_sigma_s
-    variance = np.diag(view.covariance)
-    sigma_m = math.sqrt(float(variance[:3].mean()) + (way**2 + late**2) / 3.0)
-    sigma_r = math.sqrt(float(variance[3:6].mean()))
+    sigma_m, sigma_r, _ = np.sqrt(np.diag(view.with_doubts(scale, delay_sigma_s)).reshape(3, 3).mean(axis=1)).tolist()
     return PoseEstimate(view.to_s, view.seen.T @ T, sigma_m / scale.value, sigma_r, "filter")
 
 

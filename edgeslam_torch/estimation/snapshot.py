@@ -69,7 +69,7 @@ class Present:
             view.to_s,
             T_w_seen @ T_seen_c,
             unit * (T_w_seen[:3, :3] @ view.velocity_m_s),
-            _in_world(_with_doubts(view, known), T_w_seen[:3, :3], unit),
+            _in_world(view.with_doubts(known.scale, known.delay_sigma_s), T_w_seen[:3, :3], unit),
             "filter",
             view.seen.stamp_s,
             self.metric,
@@ -102,15 +102,6 @@ class Present:
             self.metric,
             self.published.revision,
         )
-
-
-def _with_doubts(view: FilterView, known: Snapshot) -> FloatArray:
-    """The filter's covariance, with the uncertainty of delay and scale added."""
-    covariance = view.covariance.copy()
-    way = view.T_seen_c[:3, 3] * (known.scale.sigma / known.scale.value)
-    late = view.velocity_m_s * known.delay_sigma_s
-    covariance[:3, :3] += np.outer(way, way) + np.outer(late, late)
-    return covariance
 
 
 def _in_world(covariance: FloatArray, R: FloatArray, unit: float) -> FloatArray:

@@ -42,6 +42,14 @@ class FilterView:
     covariance: FloatArray
     """``(9, 9)`` of translation [m], rotation vector [rad] and velocity [m/s], in the axes of the camera at `seen`."""
 
+    def with_doubts(self, scale: ScaleEstimate, delay_sigma_s: float) -> FloatArray:
+        """The covariance, with the uncertainty of scale and delay added."""
+        covariance = self.covariance.copy()
+        way = self.T_seen_c[:3, 3] * (scale.sigma / scale.value)
+        late = self.velocity_m_s * delay_sigma_s
+        covariance[:3, :3] += np.outer(way, way) + np.outer(late, late)
+        return covariance
+
 
 class FilterFeed:
     """Converts visual poses to filter updates, relative to the pose at the last update."""
