@@ -35,8 +35,8 @@ from edgeslam_torch.types import FloatArray, IntArray
 WIDE = 60
 """Keyframes of a wide window: some 20 s of flight. With 25, the two fixed poses dominate the scale and its correction
 overshoots."""
-WIDE_EVERY = 4
-"""Period of wide windows, in windows: about a second in flight."""
+WIDE_EVERY_S = 1.0
+"""Minimum time between wide windows."""
 WIDE_STEPS = 100
 """Maximum number of solver steps: 15 are typical, the first run after a long drift takes several times that."""
 ENOUGH_ANCHORS = 300
@@ -71,8 +71,8 @@ class Mapper:
         self.lm = lm
         flying = config.window.flying
         self._edges = None if edges is None or flying is None else WindowEdges(edges, camera, flying, flying=True)
-        self._windows = 0
-        """Number of windows since the last wide one."""
+        self._wide_s = -np.inf
+        """Stamp of the last wide window."""
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
 
     def insert(
@@ -113,14 +113,13 @@ class Mapper:
         return result
 
     def _take_back_drift(self, keyframe: Keyframe, telemetry: TelemetryModel) -> None:
-        """Refine the recent map with telemetry every few keyframes.
+        """Refine the recent map with telemetry every second.
 
         The fixed keyframes of a small window preserve its scale, drifted or not, against telemetry.
         """
-        self._windows += 1
-        if self._windows < WIDE_EVERY:
+        if keyframe.stamp_s - self._wide_s < WIDE_EVERY_S:
             return
-        self._windows = 0
+        self._wide_s = keyframe.stamp_s
         window = recent_map(self.map, keyframe, WIDE)
         if window is None:
             return

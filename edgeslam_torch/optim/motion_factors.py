@@ -34,44 +34,59 @@ class MotionTerms:
             headings: Gaussians of rotations about the vertical.
             column: Free-pose number of each pose, -1 for a fixed one.
         """
-        self.centres, self.gravity, self.headings = centres, gravity, headings
-        self.column = column
+        self.centres = _together(centres, len(column))
+        self.gravity, self.headings = gravity, headings
+        self.column, self.free = column, np.flatnonzero(column >= 0)
 
     def linearise(self, T: FloatArray, H: FloatArray, g: FloatArray) -> float:
         """Add the terms at poses ``(W, 4, 4)`` to ``H (6F, 6F)`` and ``g (6F,)``; returns their cost."""
-        F = len(H) // 6
-        H, g = H.reshape(F, 6, F, 6), g.reshape(F, 6)
-        total = 0.0
-        for centre in self.centres:
-            value, by_centre = centre_cost(T[centre.pose], centre)
-            total += value
-            column = self.column[centre.pose]
-            free = np.flatnonzero(column >= 0)
-            into, R = column[free], T[centre.pose[free], :3, :3]
-            K = len(centre.pose)
-            A = centre.information.reshape(K, 3, K, 3)[free][:, :, free]
-            np.add.at(g[:, :3], into, -np.einsum("kab,kb->ka", R, by_centre[free]))
-            turned = np.einsum("iab,ibjd,jcd->iajc", R, A, R)
-            H[into[:, None], :3, into[None], :3] += turned.transpose(0, 2, 1, 3)
+        F = len(self.free)
+        blocks, g, total = H.reshape(F, 6, F, 6), g.reshape(F, 6), 0.0
+        if self.centres is not None:
+            total, by_centre = centre_cost(T, self.centres)
+            R = T[self.free, :3, :3]
+            g[:, :3] -= (R @ by_centre[self.free, :, None])[:, :, 0]
+            # R_i A_ij R_j^T, by rows and then by columns.
+            rows = R @ self.centres.information.reshape(-1, 3, 3 * len(T))[self.free]
+            both = rows.reshape(3 * F, -1, 3).transpose(1, 0, 2)[self.free] @ np.swapaxes(R, 1, 2)
+            blocks[:, :3, :, :3] += both.reshape(F, F, 3, 3).transpose(1, 2, 0, 3)
         for gravity in self.gravity:
             r = gravity_residual(T[gravity.pose], gravity)
             J = gravity_jacobian(T[gravity.pose], gravity)
             total += float(np.sum(r**2))
-            for k, i in enumerate(self.column[gravity.pose]):
-                if i >= 0:
-                    H[i, 3:, i, 3:] += J[k].T @ J[k]
-                    g[i, 3:] += J[k].T @ r[k]
+            free, into = self._free(gravity.pose)
+            J_t = np.swapaxes(J[free], 1, 2)
+            blocks[into, 3:, into, 3:] += J_t @ J[free]
+            g[into, 3:] += (J_t @ r[free, :, None])[:, :, 0]
         for heading in self.headings:
             e, J = heading_residual(T[heading.pose], heading), heading_jacobian(T[heading.pose], heading)
             slope = heading.information @ e
             total += float(e @ slope)
-            column = self.column[heading.pose]
-            free = np.flatnonzero(column >= 0)
-            into, J = column[free], J[free]
-            np.add.at(g[:, 3:], into, J * slope[free, None])
-            curvature = np.einsum("ia,ij,jb->ijab", J, heading.information[np.ix_(free, free)], J)
-            H[into[:, None], 3:, into[None], 3:] += curvature
+            free, into = self._free(heading.pose)
+            g[into, 3:] += J[free] * slope[free, None]
+            by_pose, information = np.zeros((F, 3)), np.zeros((F, F))
+            by_pose[into], information[np.ix_(into, into)] = J[free], heading.information[np.ix_(free, free)]
+            blocks[:, 3:, :, 3:] += by_pose[:, :, None, None] * (information[:, :, None] * by_pose)[:, None]
         return total
+
+    def _free(self, pose: IntArray) -> tuple[IntArray, IntArray]:
+        """Which of poses ``(n,)``, each once, are free, and their free-pose numbers."""
+        column = self.column[pose]
+        free = np.flatnonzero(column >= 0)
+        return free, column[free]
+
+
+def _together(centres: tuple[CentreFactor, ...], poses: int) -> CentreFactor | None:
+    """One Gaussian of all camera centres; None without any."""
+    if not centres:
+        return None
+    information, vector = np.zeros((poses, 3, poses, 3)), np.zeros((poses, 3))
+    for centre in centres:
+        K = len(centre.pose)
+        information[np.ix_(centre.pose, range(3), centre.pose, range(3))] += centre.information.reshape(K, 3, K, 3)
+        vector[centre.pose] += centre.vector.reshape(K, 3)
+    constant = sum(centre.constant for centre in centres)
+    return CentreFactor(np.arange(poses), information.reshape(3 * poses, -1), vector.ravel(), constant)
 
 
 def centre_cost(T_c_w: FloatArray, factor: CentreFactor) -> tuple[float, FloatArray]:
