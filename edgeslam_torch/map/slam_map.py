@@ -142,10 +142,8 @@ class SlamMap:
         if len(ids) == 0:
             return
         self.revision += 1
-        gone = np.zeros(len(self.anchors.alive) + 1, dtype=bool)
-        gone[ids] = True
-        for keyframe in self.keyframes.values():
-            keyframe.anchor[gone[keyframe.anchor]] = NO_ANCHOR
+        for keyframe, keypoints in self._keypoints_on(ids):
+            keyframe.anchor[keypoints] = NO_ANCHOR
         self.anchors.observations[ids] = 0
         self.anchors.remove(ids)
 
@@ -153,17 +151,14 @@ class SlamMap:
         """Move all observations of ``losers`` to ``winners``, ``(M,)`` each, one-to-one and disjoint."""
         if len(losers) == 0:
             return
-        target = np.full(len(self.anchors.alive) + 1, NO_ANCHOR)  # the last row stands for NO_ANCHOR
+        target = np.full(len(self.anchors.alive), NO_ANCHOR)
         target[losers] = winners
-        for keyframe in self.keyframes.values():
-            new = target[keyframe.anchor]
-            keypoints = np.flatnonzero(new >= 0)
-            if len(keypoints) == 0:
-                continue
+        for keyframe, keypoints in self._keypoints_on(losers):
+            new = target[keyframe.anchor[keypoints]]
             # One keypoint per anchor and keyframe; few here, for which np.isin is slow.
-            already = (new[keypoints, None] == keyframe.anchor).any(axis=1)
-            keyframe.anchor[keypoints] = np.where(already, NO_ANCHOR, new[keypoints])
-            self.anchors.observations[new[keypoints[~already]]] += 1
+            already = (new[:, None] == keyframe.anchor).any(axis=1)
+            keyframe.anchor[keypoints] = np.where(already, NO_ANCHOR, new)
+            self.anchors.observations[new[~already]] += 1
         self.anchors.found[winners] += self.anchors.found[losers]
         self.anchors.visible[winners] += self.anchors.visible[losers]
         self.remove_anchors(losers)
@@ -172,11 +167,9 @@ class SlamMap:
 
     def shared_counts(self, anchor_ids: IntArray) -> dict[int, int]:
         """Number of the given anchors that each keyframe observes; keyframes without any are omitted."""
-        mark = np.zeros(len(self.anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
-        mark[anchor_ids] = True
-        mark[-1] = False
-        counts = {id: int(np.count_nonzero(mark[k.anchor])) for id, k in self.keyframes.items()}
-        return {id: count for id, count in counts.items() if count > 0}
+        start, seen, _ = self._observations(anchor_ids)
+        counts = np.diff(np.searchsorted(seen, start)).tolist()
+        return {id: count for id, count in zip(self.keyframes, counts, strict=True) if count > 0}
 
     def covisible(self, keyframe: Keyframe, most: int, min_shared: int = 15) -> list[Keyframe]:
         """Other keyframes by number of shared anchors, best first."""
@@ -193,6 +186,29 @@ class SlamMap:
         for keyframe in keyframes:
             seen[keyframe.anchor] = True
         return np.flatnonzero(seen[:-1])
+
+    def _observations(self, ids: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+        """Observations of anchors, with the keypoints of all keyframes in one row.
+
+        Returns:
+            First place of each keyframe and the end of the row ``(K + 1,)``, the places that observe one of the anchors
+            ``(M,)``, ascending, and which anchors ``(M,)``.
+        """
+        wanted = np.zeros(len(self.anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
+        wanted[ids] = True
+        wanted[-1] = False
+        rows = [k.anchor for k in self.keyframes.values()]
+        start = np.cumsum([0, *map(len, rows)])
+        observed = np.concatenate([*rows, np.zeros(0, np.int64)])
+        places = np.flatnonzero(wanted[observed])
+        return start, places, observed[places]
+
+    def _keypoints_on(self, ids: IntArray) -> list[tuple[Keyframe, IntArray]]:
+        """Keyframes that observe some of the anchors, with the keypoints on them."""
+        start, places, _ = self._observations(ids)
+        parts = np.split(places, np.searchsorted(places, start[1:]))[:-1]
+        hosts = zip(self.keyframes.values(), start[:-1].tolist(), parts, strict=True)
+        return [(keyframe, part - first) for keyframe, first, part in hosts if len(part)]
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 
@@ -245,18 +261,13 @@ class SlamMap:
         """
         if len(ids) == 0:
             return
-        wanted = np.zeros(len(self.anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
-        wanted[ids] = True
-        wanted[-1] = False
         keyframes = list(self.keyframes.values())
-        observed = np.concatenate([k.anchor for k in keyframes])
-        seen = np.flatnonzero(wanted[observed])
-        observed = observed[seen]
-        host = np.repeat(np.arange(len(keyframes)), [len(k.anchor) for k in keyframes])[seen]
+        start, seen, observed = self._observations(ids)
+        host = np.searchsorted(start, seen, side="right") - 1
         ray = self.anchors.p_w[observed] - np.stack([k.centre_w for k in keyframes])[host]
         distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
         ray /= distance[:, None]
-        total = np.stack([np.bincount(observed, ray[:, i], len(wanted)) for i in range(3)], axis=1)[ids]
+        total = np.stack([np.bincount(observed, ray[:, i], len(self.anchors.alive)) for i in range(3)], axis=1)[ids]
         norm = np.linalg.norm(total, axis=1)
         self.anchors.normal[ids] = total / np.where(norm > 0, norm, 1.0)[:, None]
         # Of several observations of one anchor the last assignment remains: the newest keyframe's.

@@ -30,10 +30,14 @@ def fuse_young(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, neighbours
 def fuse_all(slam_map: SlamMap, camera: Camera) -> None:
     """Search every anchor in every keyframe of its submap, after all poses are refined."""
     anchors = slam_map.anchors
+    pieces: dict[int, list[Keyframe]] = {}
     for keyframe in slam_map.keyframes.values():
-        piece = slam_map.piece_of(keyframe.id)
-        ids = slam_map.anchors_seen_by([k for k in slam_map.keyframes.values() if slam_map.piece_of(k.id) == piece])
-        merge(slam_map, [_look_in(slam_map, camera, keyframe, ids[~anchors.from_depth[ids]])])
+        pieces.setdefault(slam_map.piece_of(keyframe.id), []).append(keyframe)
+    for keyframes in pieces.values():
+        ids = slam_map.anchors_seen_by(keyframes)
+        for keyframe in keyframes:
+            known = ids[anchors.alive[ids] & ~anchors.from_depth[ids]]
+            merge(slam_map, [_look_in(slam_map, camera, keyframe, known)])
     slam_map.refresh_anchors(np.flatnonzero(anchors.alive))
 
 
