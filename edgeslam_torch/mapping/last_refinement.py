@@ -1,10 +1,7 @@
 """Refinement of the whole map after the last keyframe, with edges and corners."""
 
-import logging
 import math
 from dataclasses import replace
-
-import numpy as np
 
 from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.estimation.displacement import TelemetryModel
@@ -14,21 +11,17 @@ from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.freed_depths import Weight
 from edgeslam_torch.mapping.fuse import fuse_all
 from edgeslam_torch.mapping.motion_terms import ALIKE_AT_THE_END
-from edgeslam_torch.mapping.refinement import refine, whole_map, window_problem, write_back
+from edgeslam_torch.mapping.refinement import refine, whole_map
 from edgeslam_torch.mapping.window_edges import WindowEdges
-from edgeslam_torch.optim.adaptive import term_residuals, term_sigmas, with_scales
-from edgeslam_torch.optim.local_ba import refine_window
-from edgeslam_torch.optim.problem import LmConfig, StopReason, WindowProblem, WindowResult
+from edgeslam_torch.optim.problem import LmConfig, WindowResult
 
-logger = logging.getLogger(__name__)
-
-EFFECTIVE_SAMPLES = 2.4
-"""Errors of neighbouring pixels on an edge are correlated: about six count as one (the root of six)."""
 ITERATIONS = 30
 COST_TOLERANCE = 1e-5
 POSE_TOLERANCE = 0.1
 """Distance to the minimum [standard deviations, all poses together]. At half a standard deviation the drift of scale in
 big steps, a direction of small curvature, is left in the map."""
+NEARLY = 1.0
+"""The same where edges are only associated, which takes poses to a pixel."""
 MU = 1e-8
 """Initial damping: scale drift, or rotation explained as translation, is a slow mode, which a solver damped by the
 stiff modes never corrects (docs/decisions/12-solver.md)."""
@@ -70,37 +63,11 @@ def last_refinement(
         with slam_map.lock:
             fuse_all(slam_map, camera)
         if (window := whole_map(slam_map, freed, ALIKE_AT_THE_END)) is not None:
-            refine(slam_map, window, camera, lm, telemetry)
+            refine(slam_map, window, camera, replace(lm, losses=False, pose_tolerance=NEARLY), telemetry)
     edges.update(everything=True)
     with slam_map.lock:
         edges.follow_anchors()
     window = whole_map(slam_map, freed, ALIKE_AT_THE_END)
     if window is None:
         return None
-    keyframes = [*window.free, *window.fixed]
-    terms = WindowEdges(edges, camera, config, flying=False)
-    problem, keypoint = window_problem(slam_map, window, camera, lm, telemetry)
-    placed = terms.place(problem, keyframes)
-    problem = placed.problem
-    if config.reprojection == "off":
-        problem, keypoint = _without_points(problem), [k[:0] for k in keypoint]
-    if len(problem.obs_pose) == 0 and not placed.has_terms:
-        return None
-    if config.adaptive:
-        sigmas = term_sigmas(term_residuals(problem))
-        problem = with_scales(problem, sigmas, EFFECTIVE_SAMPLES)
-        logger.debug("standard deviations of the terms: %s", sigmas)
-    result = refine_window(problem, lm)
-    if result.stop is not StopReason.NOT_FINITE:
-        with slam_map.lock:  # a consistent snapshot for readers
-            write_back(slam_map, window, keypoint, result)
-            terms.write_back(keyframes, placed.edges, result.edge_inverse_depth)
-        logger.debug("edges and corners: %s after %d steps", result.stop, result.iterations)
-    return result
-
-
-def _without_points(problem: WindowProblem) -> WindowProblem:
-    none = np.zeros(0, dtype=np.int64)
-    return replace(
-        problem, obs_pose=none, obs_anchor=none, uv=np.zeros((0, 2)), inv_sigma=np.zeros(0), depth_priors=None
-    )
+    return refine(slam_map, window, camera, lm, telemetry, WindowEdges(edges, camera, config, flying=False))

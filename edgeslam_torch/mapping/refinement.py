@@ -165,8 +165,10 @@ def refine(
     keyframes = [*window.free, *window.fixed]
     placed = None if edges is None else edges.place(problem, keyframes)
     problem = problem if placed is None else placed.problem
-    if len(problem.obs_pose) == 0 and (placed is None or not placed.has_terms):
-        return None
+    if len(problem.obs_pose) == 0:
+        if placed is None or not placed.has_terms:
+            return None
+        keypoint = [k[:0] for k in keypoint]
     result = refine_window(problem, config)
     if window.settled and not result.stop.converged:
         return result
@@ -175,9 +177,9 @@ def refine(
             result = with_same_depths(problem, result, len(window.free))
         elif window.settled:
             result = with_same_way(problem, result, len(window.free))
-    write_back(slam_map, window, keypoint, result)
-    if edges is not None and placed is not None and result.stop is not StopReason.NOT_FINITE:
-        with slam_map.lock:
+    with slam_map.lock:  # a consistent snapshot for readers
+        write_back(slam_map, window, keypoint, result)
+        if edges is not None and placed is not None and result.stop is not StopReason.NOT_FINITE:
             edges.write_back(keyframes, placed.edges, result.edge_inverse_depth)
     return result
 

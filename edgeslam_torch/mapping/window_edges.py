@@ -18,11 +18,15 @@ from edgeslam_torch.mapping.window_terms import (
     junction_terms,
     make_structure,
 )
+from edgeslam_torch.optim.adaptive import term_residuals, term_sigmas, with_scales
 from edgeslam_torch.optim.problem import WindowProblem
 from edgeslam_torch.types import FloatArray
 
 FEW_ANCHORS = 100
 """Number of anchors of a keyframe below which its window gets edge terms: the minimum to start a map."""
+
+EFFECTIVE_SAMPLES = 2.4
+"""Errors of neighbouring pixels on an edge are correlated: about six count as one (the root of six)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +70,8 @@ class WindowEdges:
     def place(self, problem: WindowProblem, keyframes: list[Keyframe]) -> Placed:
         """Add the terms to a window whose first poses are those of the keyframes, the free ones first.
 
-        While flying, the free keyframes' edges are used, and the others as partners.
+        While flying, the free keyframes' edges are used, and the others as partners. After the flight the terms are
+        weighted by their residuals (``adaptive``), and without ``reprojection`` there are no others.
         """
         free = int(np.count_nonzero(~problem.pose_fixed))
         terms = replace(self.terms, hosts=free) if self.flying else self.terms
@@ -74,7 +79,13 @@ class WindowEdges:
         T_c_w, K = problem.T_c_w[: len(keyframes)], problem.K
         placed = edge_terms(structures, T_c_w, K, terms) if self.config.uses_edges else None
         corners = junction_terms(structures, T_c_w, K, terms) if self.config.uses_corners else None
-        return Placed(replace(problem, edges=None if placed is None else placed.terms, junctions=corners), placed)
+        problem = replace(problem, edges=None if placed is None else placed.terms, junctions=corners)
+        if self.config.reprojection == "off" and not self.flying:
+            problem = _without_points(problem)
+        out = Placed(problem, placed)
+        if self.config.adaptive and not self.flying and (out.has_terms or len(problem.obs_pose)):
+            out = Placed(with_scales(problem, term_sigmas(term_residuals(problem)), EFFECTIVE_SAMPLES), placed)
+        return out
 
     def write_back(self, keyframes: list[Keyframe], placed: PlacedEdges | None, inverse_depth: FloatArray) -> None:
         """Write refined depths back to the keyframes' edge points."""
@@ -143,4 +154,11 @@ def term_config(config: WindowConfig) -> TermConfig:
         # The literal angle's residual is identically zero: omitting it is equivalent.
         angle_sigma=default.angle_sigma if config.angle in ("arms", "cosine") else 0.0,
         cosines=config.angle == "cosine",
+    )
+
+
+def _without_points(problem: WindowProblem) -> WindowProblem:
+    none = np.zeros(0, dtype=np.int64)
+    return replace(
+        problem, obs_pose=none, obs_anchor=none, uv=np.zeros((0, 2)), inv_sigma=np.zeros(0), depth_priors=None
     )
