@@ -212,7 +212,7 @@ def focal_from_map(camera: Camera, keyframes: Sequence[Keyframe], p_w: FloatArra
         limit = limit / 3.0 if move * last < 0 else limit  # Huber's cost is not quadratic: steps overshoot
         last = move
         log_scale += float(np.clip(move, -limit, limit))
-        if abs(move) < _CONVERGED:
+        if abs(move) < max(_CONVERGED, _CONTRADICTION / 3.0 - abs(log_scale)):  # what agrees need not be exact
             noise = float(np.sqrt(np.median(here.chi2) / _CHI2_MEDIAN))
             focal = camera.fx * math.exp(log_scale)
             relative = math.hypot(_OPTIMISM * noise / math.sqrt(max(curvature, 1e-12)), 0.02)
