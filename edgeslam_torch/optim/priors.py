@@ -7,7 +7,7 @@ import numpy as np
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.optim.blocks import add_blocks
-from edgeslam_torch.optim.kernels.tangents import logs
+from edgeslam_torch.optim.kernels.pose import logs
 from edgeslam_torch.optim.problem import RelativePosePrior, ScalePrior
 from edgeslam_torch.types import FloatArray, IntArray
 

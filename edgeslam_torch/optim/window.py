@@ -9,7 +9,7 @@ from scipy.linalg import lapack
 from edgeslam_torch.optim.blocks import Anchors, Blocks, Edges, Junctions, Normal
 from edgeslam_torch.optim.kernels import rows as compiled
 from edgeslam_torch.optim.kernels.normal_equations import back_substitute, eliminate
-from edgeslam_torch.optim.kernels.tangents import stepped
+from edgeslam_torch.optim.kernels.pose import stepped
 from edgeslam_torch.optim.levenberg_marquardt import Step, minimise
 from edgeslam_torch.optim.motion_factors import MotionTerms
 from edgeslam_torch.optim.priors import PriorTerms

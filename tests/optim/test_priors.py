@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.optim.kernels.tangents import stepped
+from edgeslam_torch.optim.kernels.pose import stepped
 from edgeslam_torch.optim.priors import PriorTerms, relative_priors
 from edgeslam_torch.optim.problem import RelativePosePrior
 

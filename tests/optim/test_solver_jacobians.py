@@ -7,7 +7,7 @@ from torch import Tensor
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry import se3_torch as lie
-from edgeslam_torch.optim.kernels.tangents import logs
+from edgeslam_torch.optim.kernels.pose import logs
 from edgeslam_torch.optim.priors import scale_prior
 from edgeslam_torch.optim.problem import ScalePrior
 
