@@ -83,7 +83,8 @@ def _together(centres: tuple[CentreFactor, ...], poses: int) -> CentreFactor | N
     information, vector = np.zeros((poses, 3, poses, 3)), np.zeros((poses, 3))
     for centre in centres:
         K = len(centre.pose)
-        information[np.ix_(centre.pose, range(3), centre.pose, range(3))] += centre.information.reshape(K, 3, K, 3)
+        blocks = centre.information.reshape(K, 3, K, 3).transpose(0, 2, 1, 3)
+        information[centre.pose[:, None], :, centre.pose] += blocks
         vector[centre.pose] += centre.vector.reshape(K, 3)
     constant = sum(centre.constant for centre in centres)
     return CentreFactor(np.arange(poses), information.reshape(3 * poses, -1), vector.ravel(), constant)
