@@ -7,10 +7,12 @@ them in ``__init__.pyi``.
 import importlib
 import os
 
-# torch's OpenMP threads spin while they wait; with a busy second core that turns a 26 ms inference
-# into 419 ms (docs/decisions/24-threads-and-seeds.md). Both must be set before torch is first imported.
+# Threads of OpenMP (torch) and OpenBLAS (numpy, scipy) spin while they wait; with a busy second core that turns a 26 ms
+# inference into 419 ms and a 1 ms factorisation into 100 ms (docs/decisions/24-threads-and-seeds.md). All must be set
+# before these libraries are first imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _HERE = os.path.dirname(os.path.realpath(__file__))
 _ROOT = os.path.dirname(_HERE)

@@ -1,6 +1,10 @@
 """What a Python user gives to the system and sees of it."""
 
 import importlib
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -95,3 +99,12 @@ def test_run_is_a_name_of_the_package_however_it_is_imported():
     assert "run" in edgeslam_torch.__all__
     with pytest.raises(TypeError, match="source"):  # it is called, and no source is given
         edgeslam_torch.run()
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="counts threads by /proc")
+@pytest.mark.parametrize(("wanted", "threads"), [({}, 1), ({"OPENBLAS_NUM_THREADS": "2"}, 2)])
+def test_linear_algebra_takes_one_thread_unless_the_user_wants_more(wanted, threads):
+    code = "import edgeslam_torch.slam, os; print(len(os.listdir('/proc/self/task')))"
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")} | wanted
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    assert (int(done.stdout) > 1) == (threads > 1)
