@@ -23,7 +23,7 @@ from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.sensors.attitude import Headings, UpDirections, headings, up_directions
 from edgeslam_torch.estimation.sensors.height import heights
 from edgeslam_torch.estimation.sensors.rows import Rows, stacked
-from edgeslam_torch.estimation.sensors.velocity import displacements, still
+from edgeslam_torch.estimation.sensors.velocity import displacements
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry.robust_statistics import tukey_weight
 from edgeslam_torch.types import FloatArray
@@ -76,8 +76,6 @@ class TelemetryModel:
     """Whether the map is only seconds old."""
     gain_sigma: tuple[float, ...] = (0.0, 0.0, 0.0)
     """Relative standard deviation of each velocity column, beyond that of the scale."""
-    standing: bool = False
-    """Whether zero readings are usable although velocities are not: zero is independent of the scale."""
 
     @property
     def knows_metres(self) -> bool:
@@ -103,7 +101,7 @@ class TelemetryModel:
         Returns:
             The Gaussian, or None without telemetry.
         """
-        if len(stamps_s) < 2 or len(self.track) < 2 or not (self.velocity or self.standing or self.height is not None):
+        if len(stamps_s) < 2 or len(self.track) < 2 or not (self.velocity or self.height is not None):
             return None
         sigma = self.scale_sigma_log if scale_sigma_log is None else scale_sigma_log
         at_s = stamps_s - self.delay_s
@@ -111,8 +109,6 @@ class TelemetryModel:
         parts = []
         if self.velocity:
             parts.append(self._displacements(at_s, p_m, per_scale_w))
-        elif self.standing:
-            parts.append(still(self._displacements(at_s, p_m, np.zeros_like(per_scale_w)), at_s))
         if self.height is not None:
             parts.append(heights(self.track, self.height, at_s, per_scale_w, self.T_b_c[:3, 3], self.delay_sigma_s))
         rows = stacked([part for part in parts if part is not None])

@@ -363,7 +363,6 @@ class MotionFusion:
             self.metres.fit.truncates,
             self._trust.attitude,
             gain_sigma=self._trust.gain_sigma,
-            standing=scale is not None and self.metres.velocity_is_right(self._trust),
         )
 
     # --- estimation ----------------------------------------------------------------------------------------------

@@ -156,18 +156,14 @@ class ScaleEstimator:
     def velocity_constrains_map(self, trust: SensorGate) -> bool:
         """Whether velocities may constrain the map: not with an inaccurate scale from heights alone."""
         measured = self.sensor_scale
-        if measured is None or not ("telemetry" in measured.source or measured.sigma < _SURE):
-            return False
-        return self.velocity_is_right(trust)
-
-    def velocity_is_right(self, trust: SensorGate) -> bool:
-        """Whether velocities are validated and consistent with the sources in use."""
-        return trust.velocity and "telemetry" not in self.decided.rejected
+        sure = measured is not None and ("telemetry" in measured.source or measured.sigma < _SURE)
+        return sure and trust.velocity and "telemetry" not in self.decided.rejected
 
     def sources(self) -> tuple[ScaleEstimate, ...]:
-        """Scale by each source alone, used or not."""
-        others = self.inertial, self.network(), self._remembered
-        return tuple(b.estimate for b in (*self._by_telemetry.values(), *others) if b is not None)
+        """Scale by each source alone, used or not; without sensors that others have outvoted."""
+        outvoted = self.decided.rejected if self.decided.used else frozenset()
+        sensors = [b for name, b in self._by_telemetry.items() if name not in outvoted]
+        return tuple(b.estimate for b in (*sensors, self.inertial, self.network(), self._remembered) if b is not None)
 
     def contradiction(self) -> str | None:
         """Warning of contradicting sources."""

@@ -121,42 +121,6 @@ def test_a_map_that_disagrees_gains_nothing_by_being_small(rng, swinging, height
     assert abs(by_size) < 0.05 * chi2(told, bent)
 
 
-def climbed(speed_m_s):
-    """A drone that flies forward at some speed and climbs at .3 m/s, told every tenth of a second."""
-    velocity = np.array([speed_m_s, 0.0, 0.3])
-    samples = [TelemetrySample(s, velocity, np.array([0.0, 0.0, 1e-4 * s])) for s in np.arange(0.0, 8.0, 0.1)]
-    stamps = np.arange(1.0, 7.0, 0.5)
-    lever = T_B_C[:3, 3]
-    return model_of(samples, velocity=False, standing=True), stamps, stamps[:, None] * velocity + lever
-
-
-@pytest.mark.parametrize("sigma", [0.02, 0.3])
-@pytest.mark.parametrize("unit", [1.0, 8.0])
-def test_a_drone_that_stands_holds_a_map_whose_unit_is_not_known(rng, sigma, unit):
-    """What it tells of standing is right however wrong the unit is, and of its climb nothing is used."""
-    model, stamps, p = climbed(0.0)
-    model = replace(model, scale=unit, scale_sigma_log=sigma)
-    told = model.positions(stamps, p)
-    assert chi2(told, p) < 0.02 * told.rows
-    rises = p + np.linspace(0.0, 1.0, len(p))[:, None] * [0.0, 0.0, 1.0]
-    assert chi2(told, rises) == pytest.approx(chi2(told, p), abs=0.02 * told.rows)
-    slides = p + np.linspace(0.0, 3.0 / unit, len(p))[:, None] * [1.0, 0.0, 0.0]
-    assert chi2(told, slides) > 5.0 * told.rows
-    told = model.positions(stamps, slides)
-    assert chi2(told, slides) > 5.0 * told.rows, "no unit explains it"
-    np.testing.assert_allclose(np.ptp(best(told, slides)[:, :2], axis=0), 0.0, atol=1e-4)
-
-
-def test_a_drone_that_moves_does_not_hold_a_map_whose_unit_is_not_known(rng):
-    model, stamps, p = climbed(0.4)
-    told = model.positions(stamps, p)
-    ahead = p + np.linspace(0.0, 3.0, len(p))[:, None] * [1.0, 0.0, 0.0]
-    assert chi2(told, ahead) == pytest.approx(chi2(told, p), abs=0.02 * told.rows)
-    assert replace(model, standing=False).positions(stamps, p) is None
-    still = replace(model, velocity=True).positions(stamps, p)
-    assert chi2(still, ahead) > 5.0 * still.rows, "where velocities may speak all of them do"
-
-
 def test_gauge_of_the_map_does_not_matter(rng, swinging):
     """The same flight in a turned, shifted map of other units."""
     model, stamps, p = flown(rng, swinging(12.0), height="tof")

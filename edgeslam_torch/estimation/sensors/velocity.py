@@ -30,8 +30,6 @@ _LASTING, _VARIES_S = 0.25, 1.0
 Over a reading of three seconds the mean error is .01 m/s at varying speed; for a constant speed it would be .029."""
 LONGEST_S = 10.0
 """Maximum time between two positions for integrated velocity."""
-_STILL_M_S = 0.05
-"""Speed along an axis below which the drone is at rest: half a step of the SDK; independent of the map's scale."""
 _NOISE_STEPS = 0.4
 """Noise of a velocity before quantisation [steps]: 0.02 to 0.03 m/s of the sensor, and 0.03 to 0.04 m/s of vision over
 a tenth of a second."""
@@ -237,26 +235,6 @@ def displacements(
         common.reshape(3 * N, -1),
         group,
         np.repeat(np.linalg.norm(d, axis=1), 3),
-    )
-
-
-def still(rows: Rows | None, at_s: FloatArray) -> Rows | None:
-    """Displacements between times ``(K,)`` along axes at rest."""
-    if rows is None:
-        return None
-    lasted_s = rows.D.sum(2) @ at_s
-    keep = np.flatnonzero(np.abs(rows.measured) < _STILL_M_S * lasted_s)
-    if len(keep) == 0:
-        return None
-    group = np.unique(rows.group[keep], return_inverse=True)[1]
-    return Rows(
-        rows.D[keep],
-        rows.measured[keep],
-        rows.white[keep],
-        rows.slow[np.ix_(keep, keep)],
-        rows.common[keep],
-        group,
-        rows.way[keep],
     )
 
 
