@@ -65,8 +65,9 @@ class ScaleEstimator:
 
         It replaces the depth network's estimate, whose error in a place is the same in every flight.
         """
-        known = scale is not None and math.isfinite(scale.sigma)
-        self._remembered = ScaleBelief(math.log(scale.value), scale.sigma / scale.value, "atlas") if known else None
+        self._remembered = None
+        if scale is not None and math.isfinite(scale.sigma):
+            self._remembered = ScaleBelief(math.log(scale.value), scale.sigma / scale.value, "atlas")
 
     def take(self, found: Mapping[str, ScaleBelief], fit: TelemetryFit | None, trust: SensorGate) -> None:
         """Update with telemetry.

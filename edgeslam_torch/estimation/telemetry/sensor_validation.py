@@ -176,8 +176,6 @@ def unproven_columns(seen: FloatArray, reported: FloatArray) -> tuple[float, ...
         seen: By the images ``(N, 3)`` [map units/s], axes of the columns.
         reported: By telemetry ``(N, 3)`` [m/s].
     """
-    if len(seen) == 0:
-        return Agreement.unproven
     expected = _ratio(seen, reported) * seen
     variance = _LEFT_OVER_M_S**2 + _MAP_SHARE**2 * np.sum(reported**2, axis=1, keepdims=True)
     right, mirrored, frozen = (
