@@ -5,6 +5,7 @@ import json
 import math
 import zlib
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -143,10 +144,14 @@ def test_a_file_that_a_crash_cut_off_is_good_up_to_there(tmp_path):
     assert found.steps[-1].before is None
 
 
-def _array(shape) -> bytes:
+@cache
+def _bomb():
+    return base64.b64encode(zlib.compress(bytes(100_000_000))).decode()
+
+
+def _array(shape):
     """A line whose array unpacks to 100 MB, whatever its shape."""
-    packed = base64.b64encode(zlib.compress(bytes(100_000_000))).decode()
-    return (json.dumps({"dtype": "<f8", "shape": shape, "zlib": packed}) + "\n").encode()
+    return (json.dumps({"dtype": "<f8", "shape": shape, "zlib": _bomb()}) + "\n").encode()
 
 
 @pytest.mark.parametrize(
