@@ -38,7 +38,7 @@ class LockstepVehicle:
         tello: LockstepTello | None = None,
         recorder: Recorder | None = None,
     ) -> None:
-        drone, paint, self.camera = drone_at(site, TELLO_TILT_RAD, IMAGE_SIZE)
+        drone, paint, self.camera = drone_at(site, TELLO_TILT_RAD, IMAGE_SIZE, ready=False)
         self.tello = tello or LockstepTello(drone, paint, seed=site.seed)
         self.over = ""
         self.flying = False

@@ -42,7 +42,10 @@ def draws(rng, count, follows):
     return np.array([error for error, _ in out]), [s for _, s in out]
 
 
-@pytest.mark.parametrize("follows", [(0.8, 1.0), (0.4, 0.8), (-0.1, 0.4)])
+@pytest.mark.parametrize(
+    "follows",
+    [(0.8, 1.0), pytest.param((0.4, 0.8), marks=pytest.mark.slow), pytest.param((-0.1, 0.4), marks=pytest.mark.slow)],
+)
 def test_truth_lies_inside_two_sigmas(rng, follows):
     error, scales = draws(rng, 100, follows)
     sigma = np.array([s.sigma for s in scales])

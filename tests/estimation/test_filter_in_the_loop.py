@@ -263,7 +263,7 @@ def test_jitter_of_visual_poses_is_counted_once(rng):
     assert np.mean(once[:, 0] ** 2) < np.mean(twice[:, 0] ** 2)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_delay_is_right_whatever_the_phase_of_the_packets(seed):
     """Frames at 20 Hz and state messages at 10 Hz in step: readings interpolated half-way are less noisy, and a search
     that does not know it prefers delays between the steps (0.36 or 0.44 s for 0.40)."""

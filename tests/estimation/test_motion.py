@@ -43,7 +43,10 @@ def test_scale_gravity_and_delay_come_out_of_a_swung_camera(rng, swinging, repla
     assert math.degrees(math.acos(min(1.0, float(up @ fusion.orientation.R_w_m[2])))) < 0.5
 
 
-@pytest.mark.parametrize(("delay_s", "latest_s"), [(0.5, 2.8), (0.3, 5.8), (0.75, 5.8)])
+@pytest.mark.parametrize(
+    ("delay_s", "latest_s"),
+    [(0.5, 2.8), pytest.param(0.3, 5.8, marks=pytest.mark.slow), (0.75, 5.8)],
+)
 def test_climb_gives_the_scale_within_its_sigma(delay_s, latest_s, swinging, replay):
     """Up by 0.8 m in 1.6 s, then on: after four half seconds; where the delay is not the guess heights are off by a
     tenth, velocities do not bear them out, and it takes until the delay is known."""
@@ -279,7 +282,7 @@ def test_a_frozen_or_silent_link_does_not_pull_the_scale(rng, swinging, replay):
     assert scales[0] == pytest.approx(scales[1], rel=0.003)  # a repeated height says nothing, like a repeated velocity
 
 
-@pytest.mark.parametrize("gap_s", [0.05, 0.5, 1.0])
+@pytest.mark.parametrize("gap_s", [0.05, pytest.param(0.5, marks=pytest.mark.slow), 1.0])
 def test_prediction_bridges_lost_vision(rng, swinging, replay, gap_s):
     """Compared with a constant pose: what telemetry adds while video is missing."""
     motion = swinging(24.0)
@@ -335,7 +338,7 @@ def test_truncated_velocities_are_told_from_rounded_ones(rng, swinging, replay):
     assert abs(errors["auto"]) < 0.05
 
 
-@pytest.mark.parametrize("truncated", [False, True])
+@pytest.mark.parametrize("truncated", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_images_tell_rounding_from_truncation(rng, swinging, replay, truncated):
     """No velocity reaches three steps, so readings alone tell nothing; read wrongly the scale is 25 % off."""
     motion = swinging(20.0, size_m=0.13)

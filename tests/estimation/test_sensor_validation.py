@@ -157,18 +157,20 @@ def told_of(rng, replay, motion, spoil, **options):
     """Scale without telemetry, fusion with it, and the true scale."""
     gauge = motion.in_gauge(rng)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=TelemetryFaults()).samples()
-    fusions = []
-    for told in ([], spoil(rng, samples, motion)):
-        fusion = MotionFusion(FusionConfig(), T_B_C)
+    without, fusion = (MotionFusion(FusionConfig(), T_B_C) for _ in range(2))
+    for either in (without, fusion):
         for _ in range(20):
-            fusion.metres.add_depth_ratio(DepthRatio(math.log(gauge.scale) + DEPTH_LOG, 0.05))
-        replay(fusion, motion, gauge, told, **options)
-        fusions.append(fusion)
-    without, fusion = fusions
+            either.metres.add_depth_ratio(DepthRatio(math.log(gauge.scale) + DEPTH_LOG, 0.05))
+    replay(fusion, motion, gauge, spoil(rng, samples, motion), **options)
     return without.scale(), fusion, gauge
 
 
-@pytest.mark.parametrize("spoil", [white, unrelated, another_flight, mirrored, standing, constant])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "spoil", [unrelated, mirrored, standing, *(pytest.param(s, marks=SLOW) for s in (white, another_flight, constant))]
+)
 def test_velocities_of_no_such_flight_are_not_believed(rng, swinging, replay, spoil):
     without, fusion, _ = told_of(rng, replay, swinging(18.0), spoil)
     scale = fusion.scale()
@@ -222,11 +224,11 @@ def half_way(change):
 @pytest.mark.parametrize(
     ("axis", "change"),
     [
-        (2, np.zeros_like),
+        pytest.param(2, np.zeros_like, marks=SLOW),
         (2, np.negative),
-        (2, half_way(lambda x: x + math.pi / 2)),
+        pytest.param(2, half_way(lambda x: x + math.pi / 2), marks=SLOW),
         (2, half_way(lambda x: 0.0 * x + x[0])),
-        (1, np.negative),
+        pytest.param(1, np.negative, marks=SLOW),
     ],
     ids=["yaw stuck", "yaw mirrored", "yaw jumping", "yaw stuck in flight", "pitch mirrored"],
 )
@@ -243,11 +245,16 @@ def test_telemetry_without_attitude_is_as_good_as_none(rng, swinging, replay):
     assert fusion.orientation.upright() is None
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
+WRONG = {"stuck": np.zeros_like, "mirrored": np.negative, "jumping": half_way(lambda x: x + 1.0)}
+
+
 @pytest.mark.parametrize(
-    "change",
-    [np.zeros_like, np.negative, half_way(lambda x: x + 1.0)],
-    ids=["stuck", "mirrored", "jumping"],
+    ("axis", "change"),
+    [
+        pytest.param(axis, change, marks=[] if axis == k else SLOW, id=f"{name} {axis}")
+        for k, (name, change) in enumerate(WRONG.items())
+        for axis in range(3)
+    ],
 )
 def test_velocities_with_one_wrong_column_tell_no_scale(rng, swinging, replay, axis, change):
     def spoil(rng, samples, motion):
@@ -501,7 +508,10 @@ def test_velocities_in_the_wrong_unit_with_nothing_beside_them_give_no_metres(rn
     assert any("right unit" in w for w in fusion.warnings())
 
 
-@pytest.mark.parametrize(("late_s", "found"), [(0.68, True), (0.72, True), (0.83, False), (0.9, False)])
+@pytest.mark.parametrize(
+    ("late_s", "found"),
+    [pytest.param(0.68, True, marks=SLOW), (0.72, True), (0.83, False), pytest.param(0.9, False, marks=SLOW)],
+)
 def test_a_delay_at_the_end_of_the_range_is_found_and_one_beyond_it_is_said(rng, swinging, replay, late_s, found):
     """Delays of -0.18 to -0.4 s where -0.2 is the least that is allowed; the search has a margin of a step beyond."""
 

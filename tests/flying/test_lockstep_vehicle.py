@@ -41,8 +41,8 @@ def knowing(monkeypatch):
     """Ground truth perception and empty images."""
     drone_at = lockstep_vehicle.drone_at
 
-    def unpainted(*arguments):
-        drone, _, camera = drone_at(*arguments)
+    def unpainted(*arguments, **options):
+        drone, _, camera = drone_at(*arguments, **options)
         DRONES.append(drone)
         return drone, lambda T_w_b: np.full((360, 480, 3), 90, np.uint8), camera
 

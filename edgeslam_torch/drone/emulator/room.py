@@ -46,7 +46,12 @@ def furnished_drone(
 
 
 def drone_at(
-    site: Site, tilt_rad: float, size: tuple[int, int], battery: float = 1.0, air: Air | None = None
+    site: Site,
+    tilt_rad: float,
+    size: tuple[int, int],
+    battery: float = 1.0,
+    air: Air | None = None,
+    ready: bool = True,
 ) -> tuple[DroneModel, Paint, Camera]:
     """The same at the start of a named site.
 
@@ -56,12 +61,12 @@ def drone_at(
         size: Width and height that are painted [px].
         battery: Charge in [0, 1].
         air: Wind and gusts; still air without it.
+        ready: Prepare all textures at once; else each when it is first seen, which takes time between two pictures.
     """
-    for (
-        quad
-    ) in site.world.quads:  # the coarse levels, which would otherwise delay their first use by a tenth of a second
-        quad.texture.level(MAX_LEVEL)
-        quad.texture.level(MAX_LEVEL - 1)
+    if ready:
+        for quad in site.world.quads:
+            quad.texture.level(MAX_LEVEL)
+            quad.texture.level(MAX_LEVEL - 1)
     camera = PRESETS["tello"].scaled(*size)
     T_b_c = camera_on_body(tilt_rad)
 

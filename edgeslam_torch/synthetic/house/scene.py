@@ -1,7 +1,7 @@
 """Assembling a `World`: surfaces, solids and lamps, with light baked into every texture."""
 
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache, partial
 
 import cv2
 import numpy as np
@@ -211,14 +211,15 @@ class Scene:
             self.surface(place.point(origin), place.direction(v), place.direction(u), paint, name, solid=solid)
 
     def world(self, name: str) -> World:
-        """Bake the light and build the world."""
-        light = self._light_maps()
-        quads = []
-        for s, field_ in zip(self.surfaces, light, strict=True):
-            quads.append(Quad(s.origin_w, s.u_w, s.v_w, Texture(_bake(s, field_, self)), s.name, s.two_sided))
+        """The world as it is now; its light is computed and baked when it is first seen."""
+        quads = [
+            Quad(s.origin_w, s.u_w, s.v_w, Texture(partial(_bake, k, self)), s.name, s.two_sided)
+            for k, s in enumerate(self.surfaces)
+        ]
         return World(quads, name, np.stack([self.low_w, self.high_w]), self.boxes)
 
-    def _light_maps(self) -> list[FloatArray]:
+    @cached_property
+    def light_maps(self) -> list[FloatArray]:
         """Light at a grid of points of every surface, 1.0 on average."""
         origin, u, v = (np.array([getattr(s, k) for s in self.surfaces]) for k in ("origin_w", "u_w", "v_w"))
         normal = np.cross(v, u)
@@ -308,8 +309,9 @@ def _rhombi(start: FloatArray, path: list[FloatArray]) -> list[tuple[FloatArray,
     return out
 
 
-def _bake(surface: Surface, light: FloatArray, scene: Scene) -> np.ndarray:
+def _bake(index: int, scene: Scene) -> np.ndarray:
     """Texture of a surface: its paint times its light."""
+    surface, light = scene.surfaces[index], scene.light_maps[index]
     width_m, height_m = float(np.linalg.norm(surface.u_w)), float(np.linalg.norm(surface.v_w))
     paint = surface.paint
     if paint.kind in PICTURES:

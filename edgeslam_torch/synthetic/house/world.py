@@ -1,7 +1,9 @@
 """A world of textured parallelograms and solid boxes."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -15,30 +17,44 @@ _CHUNK = 512
 
 
 class Texture:
-    """An image with its half-octave pyramid, built when a level is first asked for.
+    """An image with its half-octave pyramid; a level is built when it is first asked for.
 
     Threads may share one: at worst both build the same level.
     """
 
-    def __init__(self, image: np.ndarray) -> None:
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise ValueError(f"a texture is (H, W, 3) uint8, got {image.shape} {image.dtype}")
-        self._levels: dict[int, np.ndarray] = {0: np.ascontiguousarray(image)}
+    def __init__(self, image: np.ndarray | Callable[[], np.ndarray]) -> None:
+        """Args: ``image`` ``(H, W, 3)`` BGR, or what makes it: where to fly in a world needs no pictures."""
+        self._levels: dict[int, np.ndarray] = {}
+        self._make: Callable[[], np.ndarray] | None = None
+        if callable(image):
+            self._make = image
+        else:
+            self._levels[0] = _checked(image)
 
     @property
     def image(self) -> np.ndarray:
         """Finest level, ``(H, W, 3)`` BGR."""
-        return self._levels[0]
+        return self.level(0)
 
     def level(self, k: int) -> np.ndarray:
         """Level ``k``: the image shrunk by ``2 ** (k / 2)`` in width and height (area average)."""
-        found = self._levels.get(k)
-        if found is None:
+        make, found = self._make, self._levels.get(k)
+        if found is None and k == 0:
+            assert make is not None
+            found = self._levels.setdefault(0, _checked(make()))
+            self._make = None
+        elif found is None:
             source = self.level(max(k - 2, 0))
             shrink = 2.0 ** (-0.5 * min(k, 2))
             width, height = (max(1, round(n * shrink)) for n in (source.shape[1], source.shape[0]))
             found = self._levels.setdefault(k, shrunk(source, width, height))
         return found
+
+
+def _checked(image: np.ndarray) -> np.ndarray:
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise ValueError(f"a texture is (H, W, 3) uint8, got {image.shape} {image.dtype}")
+    return np.ascontiguousarray(image)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,11 +165,15 @@ class World:
         self.background = background
         self.corners_w = np.stack([q.corners_w for q in quads])
         self.normals_w = np.stack([q.normal_w for q in quads])
-        self.texels = np.array([q.texture.image.shape[0] * q.texture.image.shape[1] for q in quads], dtype=np.float64)
         self.two_sided = np.array([q.two_sided for q in quads])
         self._solid = Boxes(self.boxes)
         low, high = self.corners_w.min((0, 1)), self.corners_w.max((0, 1))
         self.bounds_w = np.stack([low, high]) if bounds_w is None else np.asarray(bounds_w, dtype=np.float64)
+
+    @cached_property
+    def texels(self) -> FloatArray:
+        """Pixels of each quad's texture ``(Q,)``."""
+        return np.array([math.prod(q.texture.image.shape[:2]) for q in self.quads], dtype=np.float64)
 
     def clearance(self, p_w: FloatArray) -> FloatArray:
         """Distance [m] of points ``(..., 3)`` to the nearest wall or solid; negative outside the bounds."""

@@ -41,5 +41,5 @@ def _reflected(quad: Quad, wall: float) -> Quad:
     flip = np.array([-1.0, 1.0, 1.0])
     origin = (quad.origin_w + quad.u_w) * flip
     origin[0] += 2.0 * wall
-    texture = Texture(np.ascontiguousarray(quad.texture.image[:, ::-1]))
+    texture = Texture(lambda: quad.texture.image[:, ::-1])
     return Quad(origin, -quad.u_w * flip, quad.v_w * flip, texture, REFLECTION, quad.two_sided)

@@ -76,7 +76,7 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
     wind = np.array([0.0, conditions.wind_m_s, 0.0])
     air = Air(wind, 0.5 * conditions.wind_m_s, np.random.default_rng([case.seed, 1]))
     drone, paint, camera = drone_at(
-        site, TELLO_TILT_RAD, IMAGE_SIZE if by_slam else DEPTH_SIZE, conditions.battery, air
+        site, TELLO_TILT_RAD, IMAGE_SIZE if by_slam else DEPTH_SIZE, conditions.battery, air, ready=False
     )
     tello = LockstepTello(drone, paint if by_slam else nothing_painted, conditions.radio, case.seed)
     seeing: Perception = TruePerception(site, drone, conditions)
