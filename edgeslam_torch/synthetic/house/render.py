@@ -120,7 +120,7 @@ def _project(world: World, camera: Camera, T_w_c: FloatArray) -> list[_Polygon]:
     st_from_uv = np.linalg.inv(frame)
     # Texels per pixel are det(st_from_uv) / iz^3 times the texture's size. Half an octave more for each doubling
     # of obliqueness, cos = plane distance times iz, keeps grazing surfaces from flickering.
-    texels = world.texels[index] / np.abs(np.linalg.det(frame))
+    texels = np.array([world.quads[k].texture.texels for k in index.tolist()]) / np.abs(np.linalg.det(frame))
     level_offset = (np.log2(texels) - 0.5 * np.log2(np.abs(side[index]))).tolist()
     near, far = c[:, :, 2].min(1), c[:, :, 2].max(1)
     clipped = near < NEAR_M

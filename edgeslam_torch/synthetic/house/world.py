@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -35,6 +34,11 @@ class Texture:
     def image(self) -> np.ndarray:
         """Finest level, ``(H, W, 3)`` BGR."""
         return self.level(0)
+
+    @property
+    def texels(self) -> int:
+        """Pixels of the finest level."""
+        return math.prod(self.image.shape[:2])
 
     def level(self, k: int) -> np.ndarray:
         """Level ``k``: the image shrunk by ``2 ** (k / 2)`` in width and height (area average)."""
@@ -169,11 +173,6 @@ class World:
         self._solid = Boxes(self.boxes)
         low, high = self.corners_w.min((0, 1)), self.corners_w.max((0, 1))
         self.bounds_w = np.stack([low, high]) if bounds_w is None else np.asarray(bounds_w, dtype=np.float64)
-
-    @cached_property
-    def texels(self) -> FloatArray:
-        """Pixels of each quad's texture ``(Q,)``."""
-        return np.array([math.prod(q.texture.image.shape[:2]) for q in self.quads], dtype=np.float64)
 
     def clearance(self, p_w: FloatArray) -> FloatArray:
         """Distance [m] of points ``(..., 3)`` to the nearest wall or solid; negative outside the bounds."""

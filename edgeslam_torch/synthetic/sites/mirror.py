@@ -18,8 +18,6 @@ def with_quads(world: World, quads: list[Quad]) -> World:
     out.quads = (*world.quads, *quads)
     out.corners_w = np.concatenate([world.corners_w, [q.corners_w for q in quads]])
     out.normals_w = np.concatenate([world.normals_w, [q.normal_w for q in quads]])
-    texels = [float(q.texture.image.shape[0] * q.texture.image.shape[1]) for q in quads]
-    out.texels = np.concatenate([world.texels, texels])
     out.two_sided = np.concatenate([world.two_sided, [q.two_sided for q in quads]])
     return out
 
