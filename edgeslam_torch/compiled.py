@@ -14,18 +14,38 @@ logger = logging.getLogger(__name__)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+_TYPED: list[tuple[Any, str]] = []
+"""Functions with the types of their arguments."""
 
-def compiled(function: Function) -> Function:
-    """The function, compiled at its first call for the types of its arguments.
+
+def compiled(types: str = "") -> Callable[[Function], Function]:
+    """The function, compiled at its first call, or by `compile_all` for the types of its arguments.
 
     Machine code is cached beside the file or, where that cannot be written, in the user's cache directory
     (``NUMBA_CACHE_DIR`` overrides it); if none is writable, every process compiles again.
+
+    Args:
+        types: Of the arguments in numba's notation, as all callers give them; empty for a function that only compiled
+            ones call.
     """
-    settings: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-    try:
-        return cast(Function, numba.njit(cache=True, **settings)(function))
-    except RuntimeError:  # no writable cache directory
-        return cast(Function, numba.njit(**settings)(function))
+
+    def compile(function: Function) -> Function:
+        settings: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+        try:
+            loops = numba.njit(cache=True, **settings)(function)
+        except RuntimeError:  # no writable cache directory
+            loops = numba.njit(**settings)(function)
+        if types:
+            _TYPED.append((loops, f"({types},)"))
+        return cast(Function, loops)
+
+    return compile
+
+
+def compile_all() -> None:
+    """Compile every imported function that is not cached: a minute once, in which a camera would not wait."""
+    for loops, types in _TYPED:
+        loops.compile(types)
 
 
 class _Notice(event.Listener):
@@ -36,7 +56,7 @@ class _Notice(event.Listener):
     def on_start(self, event: Any) -> None:
         if not self.said:
             self.said = True
-            logger.warning("compiling; once on this machine, some seconds")
+            logger.warning("compiling; once on this machine, a minute or less")
 
     def on_end(self, event: Any) -> None:
         pass

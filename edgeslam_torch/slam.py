@@ -17,6 +17,7 @@ from edgeslam_torch.atlas.atlas import Atlas, MapChange
 from edgeslam_torch.atlas.prior_map import PriorMaps
 from edgeslam_torch.atlas.saved import SavedAtlas, Unit, pack, unpack
 from edgeslam_torch.atlas.submap_graph import SubmapGraph
+from edgeslam_torch.compiled import compile_all
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.estimation.motion import MotionFusion
@@ -127,6 +128,8 @@ class EdgeSlam:
         """Vertical in the output frame after `finish`: z, unless the axes are those of a loaded map. None if unknown; z
         is then the first camera's up axis."""
         self._T_b_c = camera_on_body(np.deg2rad(config.mount.tilt_deg), config.mount.forward_m)
+        if realtime:
+            compile_all()
         if executor is None and realtime:
             executor = ThreadPoolExecutor(1, thread_name_prefix="mapping")
         lm = lm_config(config.window)

@@ -26,7 +26,28 @@ def test_without_a_place_for_a_cache_every_process_compiles(monkeypatch):
         return numba.njit(**settings)
 
     monkeypatch.setattr(module, "numba", SimpleNamespace(njit=njit))
-    assert module.compiled(lambda x: 2.0 * x)(1.5) == 3.0
+    assert module.compiled()(lambda x: 2.0 * x)(1.5) == 3.0
+
+
+FLIGHT = """
+from rendered import CAMERA, panels
+from edgeslam_torch import EdgeSlam, compiled
+
+slam = EdgeSlam(CAMERA, realtime=True)
+assert all(loops.overloads for loops, _ in compiled._TYPED)
+for frame in panels().frames:
+    slam.step(frame)
+slam.finish()
+print([loops.py_func.__name__ for loops, _ in compiled._TYPED if len(loops.overloads) > 1])
+"""
+
+
+@pytest.mark.slow
+def test_in_real_time_nothing_is_compiled_after_the_first_frame():
+    path = os.pathsep.join([str(Path(__file__).parent / "helpers"), *sys.path])
+    environment = os.environ | {"PYTHONPATH": path}
+    done = subprocess.run([sys.executable, "-c", FLIGHT], env=environment, capture_output=True, text=True)
+    assert done.stdout == "[]\n", done.stderr
 
 
 @pytest.mark.slow
@@ -54,7 +75,8 @@ def test_a_compiled_function_calls_only_those_of_its_own_file(path):
     loops = [
         node
         for node in tree.body
-        if isinstance(node, ast.FunctionDef) and any(getattr(d, "id", "") == "compiled" for d in node.decorator_list)
+        if isinstance(node, ast.FunctionDef)
+        and any(isinstance(d, ast.Call) and getattr(d.func, "id", "") == "compiled" for d in node.decorator_list)
     ]
     assert loops
     called = {

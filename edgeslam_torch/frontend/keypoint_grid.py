@@ -51,7 +51,7 @@ class KeypointGrid:
         return _near(query_uv, radius_px, self._u, self._v, self._order, self._start, self._origin, self._columns)
 
 
-@compiled
+@compiled("f8[:,::1], f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], f8[::1], i8")
 def _near(
     query_uv: FloatArray,
     radius_px: FloatArray,

@@ -55,7 +55,7 @@ def best_pairs(query: IntArray, train: IntArray, distance: IntArray, max_hamming
     return Matches(*_best_pairs(query, train, distance, max_hamming, ratio))
 
 
-@compiled
+@compiled("i8[::1], i8[::1], i8[::1], i8, f8")
 def _best_pairs(
     query: IntArray, train: IntArray, distance: IntArray, max_hamming: int, ratio: float
 ) -> tuple[IntArray, IntArray, IntArray]:

@@ -76,7 +76,7 @@ def patch_warps(uv: FloatArray, depth: FloatArray, T_to_from: FloatArray, camera
     return inverse
 
 
-@compiled
+@compiled("u1[:,::1], f8[:,::1], f8[:,:,::1]")
 def templates(image: NDArray[np.uint8], uv: FloatArray, warps: FloatArray) -> FloatArray:
     """Grey values ``(N, S, S)`` float32 around points of an image, warped to another camera; the border is replicated.
 
@@ -117,7 +117,7 @@ def find(image: NDArray[np.uint8], uv: FloatArray, patches: FloatArray) -> Found
     return Found(there, _aligned(image, there, patches))
 
 
-@compiled
+@compiled("u1[:,::1], f8[:,::1], f4[:,:,::1]")
 def _aligned(image: NDArray[np.uint8], there: FloatArray, patches: FloatArray) -> FloatArray:
     """Moves the pixels ``there`` to their patches; returns the sigmas ``(N,)``."""
     side = 2 * HALF_PX + 1

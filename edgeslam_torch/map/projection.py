@@ -45,7 +45,7 @@ def project_anchors(
     )
 
 
-@compiled
+@compiled("f8[:,::1], f8[:,::1], f8[::1], i8[::1], f8[:,::1], UniTuple(f8, 4), UniTuple(i8, 2), f8, i8")
 def _project(
     p_w: FloatArray,
     normal: FloatArray,

@@ -76,7 +76,7 @@ def preintegrate(
     return Preintegrated(np.diff(edges_s), *found[:-1], bias.copy(), complete)
 
 
-@compiled
+@compiled()
 def _exp(w: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rotation of a vector ``(3,)``, and its right Jacobian."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -89,7 +89,7 @@ def _exp(w: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.eye(3) + a * W + b * (W @ W), np.eye(3) - b * W + c * (W @ W)
 
 
-@compiled
+@compiled("f8[::1], f8[:,::1], f8[::1], f8[::1], f8, f8, f8")
 def _preintegrate(
     stamps_s: FloatArray,
     readings: FloatArray,

@@ -112,7 +112,7 @@ def _smooth(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return cv2.blur(grey, (3, 3)).astype(np.uint8, copy=False)
 
 
-@compiled
+@compiled("u1[:,:,::1], u1[:,:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1], i8")
 def _search(
     smooth: NDArray[np.uint8],
     grey: NDArray[np.uint8],
@@ -216,7 +216,7 @@ def _search(
     return inverse_depth, sigma
 
 
-@compiled
+@compiled()
 def _add_coarse(
     smooth: NDArray[np.uint8],
     ray: FloatArray,
@@ -248,7 +248,7 @@ def _add_coarse(
         x, y, z = x + dx, y + dy, z + dz
 
 
-@compiled
+@compiled()
 def _measurable(
     ray: FloatArray, along: FloatArray, across: FloatArray, low: float, high: float, size: tuple[int, int]
 ) -> tuple[float, float]:
@@ -268,7 +268,7 @@ def _measurable(
     return (share, length) if share > MIN_ACROSS else (0.0, 0.0)
 
 
-@compiled
+@compiled()
 def _fine_cost(
     grey: NDArray[np.uint8],
     ray: FloatArray,
@@ -296,7 +296,7 @@ def _fine_cost(
     return cost
 
 
-@compiled
+@compiled()
 def _interpolated(grey: NDArray[np.uint8], u: float, v: float) -> float:
     """Grey value at a pixel; the border is replicated."""
     height, width = grey.shape

@@ -17,7 +17,9 @@ NONE, RELATIVE_DEPTH, PIXEL = range(3)
 """Forms of the cycle."""
 
 
-@compiled
+@compiled(
+    "f8[:,:,::1], i8[::1], i8[::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], i8, f8, UniTuple(f8, 4)"
+)
 def edges(
     T_j_i: FloatArray,
     view: IntArray,

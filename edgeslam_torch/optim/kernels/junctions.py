@@ -18,7 +18,7 @@ MIN_ARM_PX = 1e-6
 """Minimum divisor for the length of an arm."""
 
 
-@compiled
+@compiled()
 def junctions(
     T_j_i: FloatArray,
     view: IntArray,

@@ -20,7 +20,7 @@ PIVOT = 1e-12
 """Pivot, relative to its diagonal entry, below which a direction is unobserved."""
 
 
-@compiled
+@compiled()
 def rho(s: float, delta: float) -> tuple[float, float]:
     """Huber's cost of a squared residual and its derivative, the weight, as `losses.robust.rho`."""
     if s <= delta * delta:
@@ -29,7 +29,10 @@ def rho(s: float, delta: float) -> tuple[float, float]:
     return delta * (2.0 * outside - delta), delta / outside
 
 
-@compiled
+@compiled(
+    "f8[:,::1], f8[:,:,::1], b1[::1], f8[::1], b1, f8, i8[::1], i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], "
+    "f8[:,:,::1], f8[:,::1], f8[:,:,::1]"
+)
 def accumulate(
     r: FloatArray,
     J: FloatArray,
@@ -101,7 +104,7 @@ def accumulate(
     return cost
 
 
-@compiled
+@compiled("f8[:,:,::1], f8[:,:,::1], i8[::1], i8[::1], i8[::1], i8[::1], f8[:,:,::1]")
 def coupled(
     relative: FloatArray,
     adjoint: FloatArray,
@@ -133,7 +136,7 @@ def coupled(
                         W[host, i, j] -= relative[p, i, k] * adjoint[view[p], k, j]
 
 
-@compiled
+@compiled("f8[:,:,::1], f8[:,::1], f8[:,:,::1], i8[::1], i8[::1], f8, f8[:,::1], f8[::1]")
 def eliminate(
     V: FloatArray,
     g: FloatArray,
@@ -210,7 +213,7 @@ def eliminate(
     return factor
 
 
-@compiled
+@compiled("f8[:,:,::1], f8[:,::1], f8[:,:,::1], i8[::1], i8[::1], f8[:,::1]")
 def back_substitute(
     factor: FloatArray, g: FloatArray, W: FloatArray, start: IntArray, column: IntArray, delta: FloatArray
 ) -> FloatArray:

@@ -14,7 +14,7 @@ _SERIES = np.array((-0.5, 1.0 / 12.0, 0.0, -1.0 / 720.0, 0.0, 1.0 / 30240.0))
 """B_n / n! for n = 1..6, of the inverse left Jacobian: for rotations below a radian."""
 
 
-@compiled
+@compiled("f8[:,:,::1]")
 def logs(E: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Tangents of rigid motions and their derivatives by a left perturbation.
 
@@ -79,7 +79,7 @@ def logs(E: FloatArray) -> tuple[FloatArray, FloatArray]:
     return xi, J
 
 
-@compiled
+@compiled("f8[:,:,::1], i8[::1], f8[:,::1]")
 def stepped(T: FloatArray, pose: IntArray, xi: FloatArray) -> FloatArray:
     """Poses ``(W, 4, 4)`` after left tangents ``(n, 6)`` of some ``(n,)`` of them, see `geometry.se3.exp`."""
     out, E = T.copy(), np.empty((3, 4))
@@ -109,7 +109,7 @@ def stepped(T: FloatArray, pose: IntArray, xi: FloatArray) -> FloatArray:
     return out
 
 
-@compiled
+@compiled()
 def _equations(
     T_c_w: FloatArray,
     p_w: FloatArray,
@@ -189,7 +189,10 @@ def _equations(
     return H, g, cost, chi2
 
 
-@compiled
+@compiled(
+    "f8[:,::1], Tuple((f8[:,::1], f8[:,::1], f8[::1], f8[:,::1])), UniTuple(f8, 4), UniTuple(f8[:,:,::1], "
+    "2), UniTuple(i8, 3), f8, UniTuple(f8, 2), f8, i8"
+)
 def refined(
     T_c_w: FloatArray,
     points: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
@@ -270,7 +273,7 @@ def refined(
     return T, H, chi2, count, iterations, converged
 
 
-@compiled
+@compiled()
 def _with_prior(
     T: FloatArray,
     points: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
@@ -302,7 +305,7 @@ def _with_prior(
     return H, g, cost, chi2
 
 
-@compiled
+@compiled()
 def _solve(H: FloatArray, g: FloatArray, mu: float, delta: FloatArray) -> bool:
     """Set ``delta (6,)`` to the damped step by Cholesky factorisation; False if the system is singular."""
     L = np.zeros((6, 6))

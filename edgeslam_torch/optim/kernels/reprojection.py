@@ -16,7 +16,7 @@ LEAST_SHRINKAGE = 0.1
 """Lower bound of an anchor's inverse distance after a step, relative to that before."""
 
 
-@compiled
+@compiled("f8[:,:,::1], f8[:,::1], i8[::1], i8[::1], f8[:,::1], f8[::1], UniTuple(f8, 4)")
 def reprojection(
     T_c_w: FloatArray,
     p_w: FloatArray,
@@ -67,7 +67,7 @@ def reprojection(
     return r, J, front
 
 
-@compiled
+@compiled("f8[:,:,::1], f8[:,::1], i8[::1], i8[::1], f8[::1], f8[::1]")
 def inverse_depth(
     T_c_w: FloatArray, p_w: FloatArray, pose: IntArray, anchor: IntArray, prior: FloatArray, inv_sigma: FloatArray
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
@@ -99,7 +99,7 @@ def inverse_depth(
     return r, J, front
 
 
-@compiled
+@compiled("f8[:,:,::1], f8[:,::1], i8[::1], f8[:,::1]")
 def stepped(T_c_w: FloatArray, p_w: FloatArray, host: IntArray, step: FloatArray) -> FloatArray:
     """Anchors ``(A, 3)`` after a step that is linear in their inverse distance from the pose ``host (A,)``.
 
