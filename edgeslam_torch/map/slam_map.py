@@ -263,7 +263,7 @@ class SlamMap:
             return
         keyframes = list(self.keyframes.values())
         start, seen, observed = self._observations(ids)
-        host = np.searchsorted(start, seen, side="right") - 1
+        host = np.repeat(np.arange(len(keyframes)), np.diff(np.searchsorted(seen, start)))
         ray = self.anchors.p_w[observed] - np.stack([k.centre_w for k in keyframes])[host]
         distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
         ray /= distance[:, None]
