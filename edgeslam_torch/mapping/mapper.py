@@ -99,12 +99,12 @@ class Mapper:
                 align(self.map, keyframe, self.camera)
         if drift_px is not None and drift_px > MAX_DRIFT_PX:  # the drift lies outside the window
             refine_all(self.map, self.camera, self.lm, telemetry)
-        if telemetry is not None and telemetry.knows_metres:
-            self._take_back_drift(keyframe, telemetry)
-        free, fixed = self.config.window, self.config.window_fixed
-        window = young_map(self.map, keyframe, free + fixed) or choose_window(self.map, keyframe, free, fixed)
         edges = self._edges if self._edges is not None and self._edges.wanted(keyframe) else None
-        result = refine(self.map, window, self.camera, self.lm, telemetry, edges)
+        result = self._take_back_drift(keyframe, telemetry)
+        if result is None or edges is not None:
+            free, fixed = self.config.window, self.config.window_fixed
+            window = young_map(self.map, keyframe, free + fixed) or choose_window(self.map, keyframe, free, fixed)
+            result = refine(self.map, window, self.camera, self.lm, telemetry, edges)
         with self.map.lock:
             # Refinement moves the other keyframes too little to change viewing directions.
             self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])
@@ -112,21 +112,22 @@ class Mapper:
             self.cull_keyframes(keyframe)
         return result
 
-    def _take_back_drift(self, keyframe: Keyframe, telemetry: TelemetryModel) -> None:
-        """Refine the recent map with telemetry every second.
+    def _take_back_drift(self, keyframe: Keyframe, telemetry: TelemetryModel | None) -> WindowResult | None:
+        """Refine the recent map with metric telemetry every second; None without a converged result.
 
         The fixed keyframes of a small window preserve its scale, drifted or not, against telemetry.
         """
-        if keyframe.stamp_s - self._wide_s < WIDE_EVERY_S:
-            return
+        if telemetry is None or not telemetry.knows_metres or keyframe.stamp_s - self._wide_s < WIDE_EVERY_S:
+            return None
         self._wide_s = keyframe.stamp_s
         window = recent_map(self.map, keyframe, WIDE)
         if window is None:
-            return
+            return None
         keyframes = sorted([*window.fixed, *window.free], key=lambda k: k.id)
         before = depths(self.map, keyframes)
-        refine(self.map, window, self.camera, replace(self.lm, max_iterations=WIDE_STEPS), telemetry)
+        result = refine(self.map, window, self.camera, replace(self.lm, max_iterations=WIDE_STEPS), telemetry)
         take_along(self.map, keyframes, before)
+        return result if result is not None and result.stop.converged else None
 
     def cull_recent_anchors(self, keyframe: Keyframe) -> None:
         """Remove new anchors that tracking rarely finds or that only two keyframes observe."""
