@@ -8,17 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgeslam_torch.flying.tasks import Stay
 from edgeslam_torch.navigation.drone_state import Contact, DroneState
-from edgeslam_torch.navigation.flight_record import Decision, NewTask
-from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.flight_record import Decision, NewSkill
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.navigation.openings.wall_frame import Walls
 from edgeslam_torch.navigation.pilot import Phase, Pilot
+from edgeslam_torch.navigation.skills.skill import Result, Skill
 from edgeslam_torch.navigation.supervisor import Order, Supervisor
-from edgeslam_torch.navigation.tasks import Task
 from edgeslam_torch.types import FloatArray
 
 logger = logging.getLogger(__name__)
@@ -38,7 +36,7 @@ class Moment:
     """For its layer and its path; another thread may be changing it."""
 
 
-Witness = Callable[[NewTask | Contact | DroneState | Decision], None]
+Witness = Callable[[NewSkill | Contact | DroneState | Decision], None]
 """Called by the planning thread with every input before it is processed, and with every decision."""
 Listener = Callable[[Moment], None]
 """Called by the control thread in every cycle; it must return at once."""
@@ -55,7 +53,7 @@ class FlightController:
         self, limits: NavLimits, listeners: Sequence[Listener] = (), witness: Witness = lambda entry: None
     ) -> None:
         self.limits = limits
-        self.pilot = Pilot(Stay(), limits)
+        self.pilot = Pilot(Skill(), limits)
         self.state: DroneState | None = None
         """Newest state."""
         self.last: Order | None = None
@@ -63,24 +61,23 @@ class FlightController:
         self._listeners = list(listeners)
         self._witness = witness
         self._lock = threading.Lock()
-        self._next: Task | None = None
+        self._next: Skill | None = None
         self._hold = False
         self._contact: Contact | None = None
         """Contact since the last planning cycle."""
         self._track = Places()
         self._path_m, self._clearance_m = 0.0, math.nan
 
-    def begin(self, task: Task) -> None:
-        """Set another task; it starts in the next planning cycle."""
+    def begin(self, skill: Skill) -> None:
+        """Set another skill; it starts in the next planning cycle."""
         with self._lock:
-            self._next = task
+            self._next = skill
             self._path_m, self._clearance_m = 0.0, math.nan
 
-    def ended(self) -> Phase | None:
-        """How the current task ended; None while it runs or has not started."""
+    def result(self) -> Result | None:
+        """How the current skill ended; None while it runs or has not started."""
         with self._lock:
-            phase = self.pilot.phase
-            return phase if self._next is None and phase in (Phase.DONE, Phase.STUCK) else None
+            return self.pilot.result if self._next is None else None
 
     def hold(self, hold: bool) -> None:
         """Hover, overriding the planner, until released; for an operator at the keyboard."""
@@ -94,14 +91,14 @@ class FlightController:
     def plan(self, state: DroneState) -> Decision:
         """Run a planning cycle; may be slow or hang."""
         with self._lock:
-            task, self._next = self._next, None
+            skill, self._next = self._next, None
             contact, self._contact = self._contact, None
-            if task is not None:
-                self._take_up(task)
+            if skill is not None:
+                self.pilot.begin(skill)
             if self.last is not None and not self.last.follows:
                 state = replace(state, overridden=True)
-        if task is not None:
-            self._witness(NewTask(task))
+        if skill is not None:
+            self._witness(NewSkill(skill))
         if contact is not None:
             self._witness(contact)
             self.pilot.add_contact(contact)
@@ -113,13 +110,6 @@ class FlightController:
         self._witness(decision)
         self._note_clearance(state)
         return decision
-
-    def _take_up(self, task: Task) -> None:
-        """Start a task; a look that is under way is finished first."""
-        if self.pilot.phase in (Phase.RISING, Phase.SWEEPING, Phase.SINKING):
-            self.pilot.task = task
-        else:
-            self.pilot.begin(task)
 
     def order(self, state: DroneState) -> Order:
         """Order for the drone now; takes microseconds, whatever the planner does."""
@@ -143,12 +133,8 @@ class FlightController:
                 logger.exception("a listener to the flight failed and is not called again")
                 self._listeners.remove(listener)
 
-    def known(self) -> Layer:
-        """Layer at the flight height."""
-        return self.pilot.walls().layer
-
     def walls(self) -> Walls:
-        """The same with its upright cells."""
+        """Layer at the flight height, with its upright cells."""
         return self.pilot.walls()
 
     def exits(self) -> tuple[Exit, ...]:
@@ -161,7 +147,7 @@ class FlightController:
             return self._track.p_w
 
     def flown(self) -> tuple[float, float]:
-        """Path length and minimum clearance of the current task [m]; the clearance is NaN without obstacles."""
+        """Path length and minimum clearance of the current skill [m]; the clearance is NaN without obstacles."""
         with self._lock:
             return self._path_m, self._clearance_m
 

@@ -1,8 +1,7 @@
 """Flight API: `Navigator.open`, `take_off`, `go_to`, `follow_corridor`, `find_exits`, `return_home`, `land`."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -13,15 +12,17 @@ from edgeslam_torch.flying.flight_controller import FlightController, Listener
 from edgeslam_torch.flying.recorder import Recorder
 from edgeslam_torch.flying.result import FlightRefused, FlightResult
 from edgeslam_torch.flying.simulated import is_simulated, site_of
-from edgeslam_torch.flying.tasks import Stay, WayHome
 from edgeslam_torch.flying.vehicle import Vehicle
-from edgeslam_torch.navigation.corridor.follow import FollowCorridor
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.navigation.openings.pathways import Pathway, pathways
-from edgeslam_torch.navigation.pilot import Phase
-from edgeslam_torch.navigation.tasks import ARRIVED_M, Explore, GoTo, Task
+from edgeslam_torch.navigation.skills.explore import Explore, FindExits
+from edgeslam_torch.navigation.skills.follow_corridor import FollowCorridor
+from edgeslam_torch.navigation.skills.go_to import GoTo
+from edgeslam_torch.navigation.skills.return_home import ReturnHome
+from edgeslam_torch.navigation.skills.skill import Result, Skill
+from edgeslam_torch.navigation.skills.take_off import TakeOff
 from edgeslam_torch.types import FloatArray
 
 HOME_BECAUSE = "battery low: return home"
@@ -31,10 +32,6 @@ UNCERTAIN = "to {:.2g} m: uncertainty of this submap relative to that of the tak
 """Qualifications of a result whose pose is uncertain."""
 BEYOND_M = 0.8
 """Distance behind an exit at which the drone stops."""
-_THERE_M = ARRIVED_M + 0.05
-"""Distance from a goal that is not reported: the drone drifts a little while it stops."""
-_LEAST_CORRIDOR_M = 1.0
-"""Minimum path length of a followed corridor."""
 
 
 class Navigator:
@@ -123,7 +120,7 @@ class Navigator:
                 self.recorder.close()
 
     def take_off(self) -> FlightResult:
-        """Take off, look to both sides, and wait for the metric scale.
+        """Take off, rise to the flight height, and wait for the metric scale.
 
         Raises:
             FlightRefused: If flying is not allowed or not advisable.
@@ -134,9 +131,8 @@ class Navigator:
         if self.vehicle.over:
             raise FlightRefused(f"this flight has ended ({self.vehicle.over}); open a new navigator for the next one")
         check_fit(self.allow_motion, self.vehicle.battery, self.limits, self.vehicle.camera.source.startswith(GUESS))
-        self.flight_controller.begin(Stay())
         self.vehicle.take_off()
-        return self.fly(Stay(), "in the air")
+        return self.fly(TakeOff(self.limits.height_m))
 
     def go_to(self, goal_w: Sequence[float] | FloatArray) -> FlightResult:
         """Fly to a point ``(3,)`` around obstacles, at the flight height; the point must be near that height.
@@ -147,7 +143,7 @@ class Navigator:
             FlightRefused: If the point is invalid, beyond the fence, inside an obstacle or at another height; or if the
                 scale is not metric yet.
         """
-        return self._fly_to(self._goal(goal_w), "there")
+        return self.fly(GoTo(self._goal(goal_w)))
 
     def explore(self, seconds: float) -> FlightResult:
         """Explore by frontiers; reached when the time is over or nothing is left to explore.
@@ -155,9 +151,7 @@ class Navigator:
         Raises:
             FlightRefused: If the time is not positive or the drone is not flying.
         """
-        until_s = self._until_s(seconds)
-        outcome = self.fly(Explore(until_s), "the time is over")
-        return self._in_time(outcome, until_s, "nothing is left to explore")
+        return self.fly(Explore(until_s=self._until_s(seconds)))
 
     def find_exits(self, seconds: float = 180.0) -> FlightResult:
         """Explore until an exit is found; `exits` returns it.
@@ -165,13 +159,7 @@ class Navigator:
         Raises:
             FlightRefused: As `explore`.
         """
-        until_s = self._until_s(seconds)
-        outcome = self.fly(Explore(until_s), "the time is over", lambda: bool(self.exits()))
-        if not self.vehicle.flying:
-            return outcome
-        if self.exits():
-            return replace(outcome, reached=True, reason="an exit was found")
-        return replace(self._in_time(outcome, until_s, "nothing is left to explore"), reached=False)
+        return self.fly(FindExits(until_s=self._until_s(seconds)))
 
     def exits(self) -> tuple[Exit, ...]:
         """Door-sized openings in walls, confirmed from two viewpoints so far, the nearest first."""
@@ -192,7 +180,7 @@ class Navigator:
             FlightRefused: As `go_to`.
         """
         there = exit_.beyond(BEYOND_M)
-        return self._fly_to(self._goal([there[0], there[1], self.limits.height_m]), "through the exit")
+        return self.fly(GoTo(self._goal([there[0], there[1], self.limits.height_m]), "through the exit"))
 
     def follow_corridor(self, seconds: float = 120.0) -> FlightResult:
         """Follow the current corridor ahead and around corners, through no known door.
@@ -202,15 +190,7 @@ class Navigator:
         Raises:
             FlightRefused: As `explore`.
         """
-        task = FollowCorridor(self._until_s(seconds))
-        outcome = self.fly(task, "the time is over")
-        if outcome.reached and outcome.path_m < _LEAST_CORRIDOR_M:
-            return replace(outcome, reached=False, reason="there is no corridor to follow here")
-        end = "the corridor opens into a room" if task.room else "the corridor ends"
-        outcome = self._in_time(outcome, task.until_s, end)
-        if outcome.reason.startswith(end) and not (task.room or task.wall):
-            return replace(outcome, reached=False, reason="neither a continuation nor an end is visible")
-        return outcome
+        return self.fly(FollowCorridor(until_s=self._until_s(seconds)))
 
     def return_home(self) -> FlightResult:
         """Fly back to the take-off, along the path flown while it is far.
@@ -219,37 +199,24 @@ class Navigator:
             FlightRefused: If the drone is not flying.
         """
         self._flying_state()
-        return self.fly(WayHome(self.flight_controller.track()), "home", to_home=True)
+        return self.fly(ReturnHome(self.flight_controller.track()))
 
-    def fly(
-        self, task: Task, done: str, until: Callable[[], bool] = lambda: False, to_home: bool = False
-    ) -> FlightResult:
-        """Execute a task of `navigation.tasks`; return home and land when the battery is low.
-
-        Args:
-            task: Task to execute.
-            done: Reason reported on success.
-            until: Ends the task early; the drone then hovers.
-            to_home: Whether the task itself leads home.
-        """
-        self.flight_controller.begin(task)
-        self.vehicle.fly(
-            lambda: self.flight_controller.ended() is not None or until() or (not to_home and self._wants_home())
-        )
-        path_m, clearance_m = self.flight_controller.flown()
+    def fly(self, skill: Skill) -> FlightResult:
+        """Execute a skill of `navigation.skills`; return home and land when the battery is low."""
+        controller, homewards = self.flight_controller, isinstance(skill, ReturnHome)
+        controller.begin(skill)
+        self.vehicle.fly(lambda: controller.result() is not None or (not homewards and self._wants_home()))
+        path_m, clearance_m = controller.flown()
         if not self.vehicle.flying:
             return FlightResult(False, self.vehicle.over, clearance_m, path_m)
-        if self.flight_controller.ended() is None and until():
-            self.flight_controller.begin(Stay())
-            return FlightResult(True, done, clearance_m, path_m)
-        if self.flight_controller.ended() is None:
+        result = controller.result()
+        if result is None:
+            result = Result(False, HOME_BECAUSE)
             self.return_home()
             if self.vehicle.flying:
                 self.vehicle.land(HOME_BECAUSE)
-            return FlightResult(False, HOME_BECAUSE, clearance_m, path_m)
-        if self.flight_controller.ended() is not Phase.DONE:
-            return FlightResult(False, self.flight_controller.pilot.why_stuck(), clearance_m, path_m)
-        return FlightResult(True, done + self._rests_on(), clearance_m, path_m)
+        reason = result.reason + self._rests_on() if result.reached else result.reason
+        return FlightResult(result.reached, reason, clearance_m, path_m)
 
     def land(self) -> FlightResult:
         """Land; reached when the drone reports that it stands.
@@ -263,18 +230,10 @@ class Navigator:
         self.vehicle.land("as commanded")
         return FlightResult(self.vehicle.over == "as commanded", f"landed: {self.vehicle.over}", clearance_m, path_m)
 
-    def _fly_to(self, goal_w: FloatArray, done: str) -> FlightResult:
-        """Fly to a checked point ``(3,)``; the reason gives the remaining distance if it is not negligible."""
-        task = GoTo(goal_w)
-        outcome, state = self.fly(task, done), self.flight_controller.state
-        if not outcome.reached or state is None or (away_m := task.away_m(state)) < _THERE_M:
-            return outcome
-        return replace(outcome, reason=f"{done}, {away_m:.2f} m from it by the estimated pose" + self._rests_on())
-
     def _goal(self, goal_w: Sequence[float] | FloatArray) -> FloatArray:
         goal = check_goal(goal_w, self.limits)
         self._flying_state()
-        return check_goal(goal, self.limits, self.flight_controller.known())
+        return check_goal(goal, self.limits, self.flight_controller.walls().layer)
 
     def _flying_state(self) -> DroneState:
         """Newest state of a flight with metric scale.
@@ -301,11 +260,6 @@ class Navigator:
         if not 0 < seconds < 3600:
             raise FlightRefused(f"the time must be more than 0 s and less than an hour, got {seconds} s")
         return self._flying_state().stamp_s + seconds
-
-    def _in_time(self, outcome: FlightResult, until_s: float, why: str) -> FlightResult:
-        """The result with another reason if the task was complete before the time was over."""
-        early = self.flight_controller.state is not None and self.flight_controller.state.stamp_s < until_s
-        return replace(outcome, reason=why + self._rests_on()) if outcome.reached and early else outcome
 
     def _rests_on(self) -> str:
         """Qualification of a reached result by the uncertainty of the pose."""

@@ -13,7 +13,7 @@ from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.flying.flight_controller import Moment
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.navigation.drone_state import Contact, DroneState
-from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, PlanLog
+from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewSkill, PlanLog
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.types import Frame
@@ -81,7 +81,7 @@ class Recorder:
                 self._guarded(lambda _: moments.write(_line(moment)))
                 self._note_exits(moment.pilot.exits.exits)
 
-    def planner(self, entry: NewTask | Contact | DroneState | Decision) -> None:
+    def planner(self, entry: NewSkill | Contact | DroneState | Decision) -> None:
         """Write an input or a decision of the planner."""
         with self._lock:
             plan = self._plan

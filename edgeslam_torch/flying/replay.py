@@ -12,7 +12,7 @@ import numpy as np
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityCommand
-from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, read_plan
+from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewSkill, read_plan
 from edgeslam_torch.navigation.limits import NavLimits
 
 _SAME = 0.02
@@ -45,7 +45,7 @@ class Replay:
     limits: NavLimits
     """Limits of the replay."""
     steps: tuple[Step, ...]
-    tasks: tuple[str, ...]
+    skills: tuple[str, ...]
     """Names, in order."""
 
     @property
@@ -71,7 +71,7 @@ def replay(folder: Path, **limits: float) -> Replay:
     if not isinstance(recorded, NavLimits):
         raise SourceError(f"{path}: does not begin with the flight's limits")
     used = replace(recorded, **limits)
-    flight_controller, seen, steps, tasks = FlightController(used), None, [], []
+    flight_controller, seen, steps, skills = FlightController(used), None, [], []
     for entry in entries:
         if isinstance(entry, Decision):
             if seen is not None:
@@ -81,9 +81,9 @@ def replay(folder: Path, **limits: float) -> Replay:
         if seen is not None:  # no answer was recorded
             steps.append(_decided(flight_controller, seen, None))
             seen = None
-        if isinstance(entry, NewTask):
-            flight_controller.begin(entry.task)
-            tasks.append(type(entry.task).__name__)
+        if isinstance(entry, NewSkill):
+            flight_controller.begin(entry.skill)
+            skills.append(type(entry.skill).__name__)
         elif isinstance(entry, Contact):
             flight_controller.feel(entry)
         elif isinstance(entry, DroneState):
@@ -92,7 +92,7 @@ def replay(folder: Path, **limits: float) -> Replay:
         steps.append(_decided(flight_controller, seen, None))
     if not steps:
         raise SourceError(f"{path}: the record holds no state")
-    return Replay(used, tuple(steps), tuple(tasks))
+    return Replay(used, tuple(steps), tuple(skills))
 
 
 def summary(found: Replay) -> list[str]:
@@ -101,7 +101,8 @@ def summary(found: Replay) -> list[str]:
     began = steps[0].state.stamp_s
     took_ms = 1e3 * np.array([step.planning_s for step in steps])
     lines = [
-        f"{len(steps)} decisions in {steps[-1].state.stamp_s - began:.1f} s, tasks: {', '.join(found.tasks) or 'none'}",
+        f"{len(steps)} decisions in {steps[-1].state.stamp_s - began:.1f} s, "
+        f"skills: {', '.join(found.skills) or 'none'}",
         f"the same: {len(steps) - len(differing)} of {len(steps)}",
     ]
     for step in differing[:1]:

@@ -1,4 +1,4 @@
-"""Record of a planner's inputs and decisions: one JSON line per limits, task, contact, state and decision.
+"""Record of a planner's inputs and decisions: one JSON line per limits, skill, contact, state and decision.
 
 A state is written before the planner processes it, so that the record shows the input of a hang or crash. A truncated
 last line is ignored. Numbers are exact, so that a replay decides the same.
@@ -21,10 +21,10 @@ from edgeslam_torch.files.appender import Appender
 from edgeslam_torch.files.plain import open_plain
 from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.tasks import Task
+from edgeslam_torch.navigation.skills.skill import Skill
 
 PLAN = "plan.jsonl"
-_HEAD = {"format": "edgeslam planner", "version": 2}
+_HEAD = {"format": "edgeslam planner", "version": 3}
 _MAX_BYTES = 1 << 26
 """Maximum size of a line and of an array in it; the largest view has 2 MB."""
 _OURS = ("edgeslam_torch.navigation.", "edgeslam_torch.flying.")
@@ -40,13 +40,13 @@ class Decision:
 
 
 @dataclass(frozen=True, slots=True)
-class NewTask:
-    """Start of a task."""
+class NewSkill:
+    """Start of a skill."""
 
-    task: Task
+    skill: Skill
 
 
-Entry = NavLimits | NewTask | Contact | DroneState | Decision
+Entry = NavLimits | NewSkill | Contact | DroneState | Decision
 
 
 class PlanLog:
@@ -69,7 +69,7 @@ class PlanLog:
 
         Raises:
             OSError: If the disk is full; the file stays valid up to here.
-            OutputError: If a task holds a value that cannot be serialised.
+            OutputError: If a skill holds a value that cannot be serialised.
         """
         self._file.write(json.dumps(_encoded(entry)) + "\n")
 

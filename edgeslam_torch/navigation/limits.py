@@ -39,10 +39,6 @@ class NavLimits:
         if not 0 <= self.land_battery <= self.home_battery < 1:
             raise ValueError(f"0 <= land_battery <= home_battery < 1: {self}")
 
-    def stopping_m(self, speed_m_s: float) -> float:
-        """Stopping distance [m] from a speed: latency at constant speed, then exponential decay."""
-        return speed_m_s * (self.reaction_s + self.settle_s)
-
     def clearance_m(self, position_sigma_m: float) -> float:
         """Required distance [m] of the drone's centre from non-free space: hull, margin and two standard deviations."""
         return self.radius_m + self.margin_m + 2.0 * position_sigma_m

@@ -27,7 +27,8 @@ _MISS, _HIT = np.float32(-0.5), np.float32(1.2)
 _LIMIT = np.float32(4.0)
 FREE, SOLID = -0.8, 0.4
 """Free after two misses; solid after one hit."""
-_FLOWN = np.float32(-4.0)
+_FLOWN = -_LIMIT - 2 * _HIT
+"""Where the body passed, the best measurement of free space: only three hits occupy such a cell again."""
 _SHIFT = 20
 """The grid moves in steps of this many cells."""
 _SIGMAS = 2.0
@@ -212,7 +213,7 @@ class Space:
         inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
         passed = index[inside & (z + 0.5 * CELL_M < nearest)]
         odds = self._odds.reshape(-1)
-        odds[passed] = np.maximum(odds[passed] + _MISS, -_LIMIT)
+        odds[passed] = np.minimum(odds[passed], np.maximum(odds[passed] + _MISS, -_LIMIT))
 
     def _cells_before(self, view: View, height: int, width: int) -> tuple[np.ndarray, FloatArray]:
         """Cells in the field of view: flat index ``(N,)`` and centre in the camera frame ``(N, 3)``."""
@@ -246,20 +247,18 @@ class Space:
         z = depth[v, u]
         rays = np.stack([(u - view.K[0, 2]) / view.K[0, 0], (v - view.K[1, 2]) / view.K[1, 1], np.ones(len(u))], 1)
         p = (z[:, None] * rays) @ view.T_w_c[:3, :3].T + view.T_w_c[:3, 3]
-        self._mark(p)
+        self.mark(p)
 
-    def points(self, p_w: FloatArray) -> None:
-        """Mark surface points ``(N, 3)`` [m], such as edges and anchors, as occupied."""
-        self._mark(np.asarray(p_w, dtype=np.float64))
-
-    def _mark(self, p_w: FloatArray) -> None:
+    def mark(self, p_w: FloatArray) -> None:
+        """Mark cells of surface points ``(N, 3)`` [m] as occupied."""
         cell = np.floor(p_w / CELL_M).astype(int)
         cell[:, 2] = np.floor((p_w[:, 2] - self.floor_m) / CELL_M).astype(int)
         cell[:, :2] -= self._corner
         inside = ((cell >= 0) & (cell < [SIDE, SIDE, LEVELS])).all(1)
         index = np.unique(np.ravel_multi_index(tuple(cell[inside].T), self._odds.shape))
         odds = self._odds.reshape(-1)
-        odds[index] = np.minimum(np.maximum(odds[index], _MISS) + _HIT, _LIMIT)
+        before = np.where(odds[index] < -_LIMIT, odds[index], np.maximum(odds[index], _MISS))
+        odds[index] = np.minimum(before + _HIT, _LIMIT)
 
     def _pass(self, p_w: FloatArray, radius_m: float) -> None:
         """Mark a position of the drone as flown and free."""

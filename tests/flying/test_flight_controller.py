@@ -10,6 +10,7 @@ from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.navigation.drone_state import DroneState, VelocityCommand
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.pilot import Phase
+from edgeslam_torch.navigation.skills.skill import Result
 from edgeslam_torch.navigation.supervisor import Danger
 
 AHEAD = VelocityCommand(forward_m_s=0.4, why="ahead")
@@ -19,12 +20,12 @@ class Steady:
     """A planner with one command, or one that hangs."""
 
     def __init__(self, command=AHEAD):
-        self.command, self.phase, self.layer, self.task = command, Phase.FLYING, None, None
+        self.command, self.phase, self.layer, self.result = command, Phase.FLYING, None, None
         self.go_on = threading.Event()
         self.go_on.set()
 
-    def begin(self, task):
-        self.task, self.phase = task, Phase.FLYING
+    def begin(self, skill):
+        self.result = None
 
     def update(self, state):
         assert self.go_on.wait(20.0)
@@ -84,7 +85,7 @@ def test_an_empty_battery_lands_whoever_holds_it(flight_controller):
     assert flight_controller.order(state(0.1, battery=0.05)).land
 
 
-def test_way_is_counted_for_each_task_and_the_track_for_the_flight(flight_controller):
+def test_way_is_counted_for_each_skill_and_the_track_for_the_flight(flight_controller):
     for k in range(21):
         flight_controller.order(state(0.05 * k, 0.05 * k))
     assert flight_controller.flown()[0] == pytest.approx(1.0, abs=0.11)
@@ -96,13 +97,13 @@ def test_way_is_counted_for_each_task_and_the_track_for_the_flight(flight_contro
     assert flight_controller.track()[-1] == pytest.approx([1.5 * length, 0.0]), "longer metres, a longer track"
 
 
-def test_a_task_has_ended_only_when_the_pilot_took_it_up(flight_controller):
-    flight_controller.pilot.phase = Phase.DONE
-    assert flight_controller.ended() is Phase.DONE
+def test_a_skill_has_ended_only_when_the_pilot_took_it_up(flight_controller):
+    flight_controller.pilot.result = before = Result(True, "there")
+    assert flight_controller.result() is before
     flight_controller.begin(object())
-    assert flight_controller.ended() is None
+    assert flight_controller.result() is None
     flight_controller.plan(state(0.0))
-    assert flight_controller.ended() is None and flight_controller.pilot.phase is Phase.FLYING
+    assert flight_controller.result() is None
 
 
 def test_a_listener_that_fails_ends_no_flight(flight_controller):

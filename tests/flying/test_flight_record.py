@@ -15,15 +15,16 @@ from edgeslam_torch.errors import OutputError, SourceError
 from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.flying.recorder import EXITS, Recorder
 from edgeslam_torch.flying.replay import replay, summary
-from edgeslam_torch.flying.tasks import WayHome
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
-from edgeslam_torch.navigation.corridor.follow import FollowCorridor
 from edgeslam_torch.navigation.drone_state import HOVER, Contact, DroneState, View
-from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, PlanLog, read_plan
+from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewSkill, PlanLog, read_plan
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
-from edgeslam_torch.navigation.tasks import Explore, GoTo
+from edgeslam_torch.navigation.skills.explore import Explore
+from edgeslam_torch.navigation.skills.follow_corridor import FollowCorridor
+from edgeslam_torch.navigation.skills.go_to import GoTo
+from edgeslam_torch.navigation.skills.return_home import ReturnHome
 
 TICK_S = 0.1
 
@@ -72,10 +73,10 @@ def test_entries_come_back_to_the_last_bit(tmp_path):
     limits = NavLimits(speed_m_s=1.0 / 3.0)
     seen = replace(state(0.2, (0.1, 1.0 / 3.0, 1.2)), seen_s=math.nan, revision=2, metric=False)
     entries = [
-        NewTask(GoTo(np.array([1.0, -2.0, 1.15]))),
-        NewTask(Explore(math.inf)),
-        NewTask(WayHome(np.zeros((0, 2)))),
-        NewTask(FollowCorridor(7.5)),
+        NewSkill(GoTo(np.array([1.0, -2.0, 1.15]))),
+        NewSkill(Explore(until_s=math.inf)),
+        NewSkill(ReturnHome(np.zeros((0, 2)))),
+        NewSkill(FollowCorridor(until_s=7.5)),
         seen,
         Decision(HOVER, "flying"),
     ]
@@ -84,9 +85,9 @@ def test_entries_come_back_to_the_last_bit(tmp_path):
         log.add(entry)
     log.close()
     first, goto, explore, home, follow, back, decision = read_plan(tmp_path / PLAN)
-    assert first == limits and decision == entries[-1] and explore.task.until_s == math.inf
-    assert follow.task.until_s == 7.5 and not follow.task.room
-    assert goto.task.goal_w.tolist() == [1.0, -2.0, 1.15] and home.task.track_w.shape == (0, 2)
+    assert first == limits and decision == entries[-1] and explore.skill.until_s == math.inf
+    assert follow.skill.until_s == 7.5 and not follow.skill.wall
+    assert goto.skill.goal_w.tolist() == [1.0, -2.0, 1.15] and home.skill.track_w.shape == (0, 2)
     assert (back.p_w == seen.p_w).all() and math.isnan(back.seen_s) and back.revision == 2 and back.metric is False
     assert back.view.depth_m.dtype == np.float32 and (back.view.depth_m == seen.view.depth_m).all()
     assert (back.view.T_w_c == seen.view.T_w_c).all() and (back.view.K == seen.view.K).all()
@@ -96,7 +97,7 @@ def test_the_same_planner_decides_the_same(flight):
     folder, decisions = flight
     found = replay(folder)
     assert [step.now for step in found.steps] == decisions
-    assert not found.differing and found.tasks == ("GoTo",)
+    assert not found.differing and found.skills == ("GoTo",)
 
 
 def test_what_was_felt_and_not_seen_turns_it_away_and_is_replayed(tmp_path):
@@ -159,7 +160,7 @@ def _array(shape):
     [
         (lambda lines: [lines[0], lines[1], b"{half a line\n", *lines[2:]], "line 3 is damaged"),
         (lambda lines: [b'{"format": "soup"}\n', *lines[1:]], "not a planner's record"),
-        (lambda lines: [lines[0].replace(b"2", b"9"), *lines[1:]], "version 9 is not supported"),
+        (lambda lines: [lines[0].replace(b"3", b"9"), *lines[1:]], "version 9 is not supported"),
         (lambda lines: [lines[0], b'{"kind": "os:system"}\n'], "os:system is unknown"),
         (lambda lines: [lines[0], b'{"kind": "edgeslam_torch.config:SlamConfig"}\n'], "SlamConfig is unknown"),
         (lambda lines: [lines[0], lines[1], lines[2].replace(b"GoTo", b"GoBy"), *lines[3:]], "GoBy is unknown"),
@@ -174,7 +175,7 @@ def _array(shape):
 )
 def test_damaged_files_are_refused_in_words(damage, words, tmp_path, capsys):
     fly_short = PlanLog(tmp_path / PLAN, NavLimits())
-    fly_short.add(NewTask(GoTo(np.ones(3))))
+    fly_short.add(NewSkill(GoTo(np.ones(3))))
     fly_short.add(state(0.0, (0.0, 0.0, 0.9)))
     fly_short.close()
     lines = (tmp_path / PLAN).read_bytes().splitlines(keepends=True)
@@ -193,10 +194,10 @@ def test_replay_says_what_it_found_and_refuses_bad_limits(tmp_path, capsys):
     assert "--record DIR" in capsys.readouterr().err
 
 
-def test_a_task_that_no_file_can_hold_is_said(tmp_path):
+def test_a_skill_that_no_file_can_hold_is_said(tmp_path):
     log = PlanLog(tmp_path / PLAN, NavLimits())
     with pytest.raises(OutputError, match="cannot hold a set"):
-        log.add(NewTask(GoTo({1})))
+        log.add(NewSkill(GoTo({1})))
     log.close()
     with pytest.raises(SourceError, match="holds no state"):
         replay(tmp_path)

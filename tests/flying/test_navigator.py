@@ -9,12 +9,11 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.flying.navigator import DEAD_RECKONING, UNCERTAIN, UNRELATED, Navigator
 from edgeslam_torch.flying.result import FlightRefused
-from edgeslam_torch.flying.tasks import Stay
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.pilot import Phase
+from edgeslam_torch.navigation.skills.skill import NO_WAY, Result, Skill
 
 TICK_S = 0.05
 WALL_M = 4.0
@@ -106,21 +105,11 @@ def test_an_outcome_says_what_it_rests_on(tracked, apart_m, reason):
     nav.flight_controller.state = DroneState(
         9.0, np.zeros(3), 0.0, np.zeros(3), tracked=tracked, submap_sigma_m=apart_m
     )
-    nav.flight_controller.ended = lambda: Phase.DONE
-    outcome = nav.fly(Stay(), "home")
+    nav.flight_controller.result = lambda: Result(True, "home")
+    outcome = nav.fly(Skill())
     assert (outcome.reached, outcome.reason) == (True, reason)
-    explored = nav.explore(60.0)
-    assert explored.reason == reason.replace("home", "nothing is left to explore")
-
-
-@pytest.mark.parametrize(("x", "reason"), [(2.1, "there"), (1.6, "there, 0.40 m from it by the estimated pose")])
-def test_an_outcome_says_how_near_to_its_goal_it_is(x, reason):
-    nav = navigator()
-    nav.vehicle.flying, nav.vehicle.fly = True, lambda until: None
-    nav.flight_controller.state = DroneState(9.0, np.array([x, 0.0, 1.15]), 0.0, np.zeros(3))
-    nav.flight_controller.known = lambda: None
-    nav.flight_controller.ended = lambda: Phase.DONE
-    assert nav.go_to((2.0, 0.0, 1.15)).reason == reason
+    nav.flight_controller.result = lambda: NO_WAY
+    assert nav.explore(60.0).reason == NO_WAY.reason, "a failure rests on nothing"
 
 
 @pytest.mark.slow

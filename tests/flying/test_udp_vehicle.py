@@ -55,12 +55,12 @@ class Steady:
     """A planner with one command, or one that hangs."""
 
     def __init__(self):
-        self.command, self.phase, self.layer, self.task = VelocityCommand(forward_m_s=0.3), Phase.FLYING, None, None
+        self.command, self.phase, self.layer, self.result = VelocityCommand(forward_m_s=0.3), Phase.FLYING, None, None
         self.go_on = threading.Event()
         self.go_on.set()
 
-    def begin(self, task):
-        self.task = task
+    def begin(self, skill):
+        self.result = None
 
     def update(self, state):
         self.go_on.wait(60.0)

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from views import moved
 
-from edgeslam_torch.navigation.corridor.corridor_geometry import mouths
-from edgeslam_torch.navigation.corridor.follow import FollowCorridor
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import MapViews
 from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
+from edgeslam_torch.navigation.skills.follow_corridor import FollowCorridor
 
 
 def seen(is_solid, is_unseen=lambda x, y: np.zeros(x.shape, bool)):
@@ -84,7 +83,8 @@ def test_unknown_space_behind_the_start_is_ignored():
     layer = seen(lambda x, y: (np.abs(y) > 1.0) | (x > 4.0), lambda x, y: x < -2.0)
     task = FollowCorridor()
     task.goals(layer, state(0.0))
-    assert len(task.goals(layer, state(3.3, stamp_s=5.0))) == 0
+    task.goals(layer, state(3.3, stamp_s=5.0))
+    assert len(task._end)
 
 
 @pytest.mark.parametrize("width", [2.0, 2.4])
@@ -93,8 +93,8 @@ def test_corridor_flown_along_one_side_is_no_continuation(width):
     way = [(x, 0.6 - 0.5 * width) for x in np.arange(-4.0, 4.7, 0.4)]
     task = FollowCorridor()
     for k, (x, y) in enumerate(way):
-        found = task.goals(layer, state(x, y, 0.5 * k))
-    assert len(found) == 0, "a turn on the spot at the end"
+        task.goals(layer, state(x, y, 0.5 * k))
+    assert len(task._end), "it is at the end"
 
 
 def test_end_needs_an_obstacle_ahead():
@@ -139,7 +139,9 @@ def test_unknown_space_ahead_is_the_goal():
     nothing = seen(lambda x, y: np.abs(y) > 1.0, lambda x, y: np.abs(x) > 0.3)
     assert place(FollowCorridor(), nothing, state(0.0)) == pytest.approx([1.5, 0.0], abs=0.1)
     assert len(FollowCorridor().goals(seen(lambda x, y: x > 1.2, lambda x, y: np.abs(x) > 0.3), state(0.0)))
-    assert len(FollowCorridor().goals(seen(sides(end=0.9)), state(0.4))) == 0
+    task = FollowCorridor()
+    task.goals(seen(sides(end=0.9)), state(0.4))
+    assert len(task._end)
 
 
 def test_backing_up_keeps_the_direction():
@@ -147,10 +149,6 @@ def test_backing_up_keeps_the_direction():
     layer = seen(sides(), lambda x, y: x > 4.0)
     way = [(x, 0.0) for x in np.arange(-4.0, 2.1, 0.5)]
     assert follow(FollowCorridor(), layer, *way, (1.0, 0.1), (0.0, 0.0), (-1.0, 0.0))[0] > 3.0
-
-
-ALONG_X = np.array([[x, 0.0] for x in range(3)])
-"""A way, a metre from place to place."""
 
 
 def stub(x, y):
@@ -177,60 +175,41 @@ def test_side_corridor_is_entered_once_its_mouth_is_seen():
     assert last == pytest.approx([0.0, 1.6], abs=0.3)
 
 
-def test_side_openings_are_inspected_before_a_wall():
-    """In passing, only the missing wall of the side corridor was observed."""
-    layer = seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
-    to_its_end = [(x, 0.0) for x in np.arange(-4.0, 2.5, 0.4)]
-    assert follow(FollowCorridor(), layer, *to_its_end) == pytest.approx([0.0, 1.2], abs=0.2)
-    specks = seen(lambda x, y: stub(x, y) | (np.abs(x) < 0.1) & (np.abs(y - 0.6) < 0.1), lambda x, y: y > 2.0)
-    assert len(mouths(specks, np.array([2.4, 0.0]), np.array([1.0, 0.0]), ALONG_X)) == 1, "noise is no wall"
-    door = seen(lambda x, y: (np.abs(y) > 1.0) & ((np.abs(x) > 0.5) | (y < 0.0)) | (x > 3.0), lambda x, y: y > 1.1)
-    assert len(mouths(door, np.array([2.4, 0.0]), np.array([1.0, 0.0]), ALONG_X)) == 0, "a door is none"
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_entry_corridor_is_no_side_opening(side):
-    """Otherwise the drone would return to the dead end from the other corridor."""
-    layer = seen(stub, lambda x, y: (np.abs(x) < 1.0) & (y < -2.0))
-    end, axis = np.array([0.0, 4.0]), np.array([0.0, 1.0])
-    for past in (0.0, 0.8 * side):
-        way = np.stack([np.full(5, past), np.arange(5.0)], 1)
-        assert len(mouths(layer, end, axis, way)) == 2, "flown past, not through"
-    to_the_dead_end = ALONG_X * [side, 1.0] + [0.0, 0.4]
-    assert layer.centres(mouths(layer, end, axis, to_the_dead_end))[:, 0] * side == pytest.approx([-1.2], abs=0.1)
-
-
-def before_a_wall(task, layer):
-    """Goals at the dead end during the full turn and at the viewpoint of the side looks."""
-    for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
+def at_the_end(task, layer, end_m=2.4):
+    """Goals of a task that has come to an apparent end."""
+    for k, x in enumerate(np.arange(-4.0, end_m + 0.1, 0.4)):
         found = task.goals(layer, state(x, 0.0, 0.5 * k))
-    assert len(found) == 0, "a turn on the spot first"
-    wanted = place(task, layer, state(2.4, 0.0, 20.6))
-    for x in (2.0, 1.6, 1.2, 0.8, 0.3):
-        assert task.heading_rad(state(x, 0.0, 24.0 - x)) is None, "not there yet"
-        task.goals(layer, state(x, 0.0, 24.0 - x))
-    return wanted
+    return layer.centres(found).reshape(-1, 2)
 
 
-def test_unknown_sides_are_scanned_before_the_end():
-    """Nothing of the side corridor was observed in passing."""
-    layer, task = seen(stub, lambda x, y: (y > 0.9) & (x < 2.6)), FollowCorridor()
-    assert before_a_wall(task, layer) == pytest.approx([0.2, 0.0], abs=0.1)
-    assert task.heading_rad(state(0.3, 0.0, 25.0)) == pytest.approx(math.pi / 2)
-    assert task.heading_rad(state(0.3, 0.0, 25.9, yaw=1.57)) == pytest.approx(math.pi / 2), "it stands a second"
-    assert task.heading_rad(state(0.3, 0.0, 26.1, yaw=1.57)) is None, "the right one is known to be a wall"
-    assert place(task, seen(stub), state(0.3, 0.0, 26.5))[1] > 1.6, "what it saw there"
-    assert place(task, layer, state(0.3, 0.0, 27.0)) == pytest.approx([2.4, 0.0], abs=0.1), "nothing: back to the end"
-    assert not task.done(state(1.0, 0.0, 28.0))
-    assert len(task.goals(layer, state(2.2, 0.0, 30.0))) == 0 and task.done(state(2.2, 0.0, 30.0))
+def look(task, layer, now_s, x=2.4):
+    """Turn as the task wants until it wants no more; the time, and the headings."""
+    yaw, seen_rad = 0.0, []
+    for k in range(400):
+        now = state(x, 0.0, now_s + 0.1 * k, yaw)
+        task.goals(layer, now)
+        if (wanted := task.look_rad(now)) is None:
+            break
+        yaw += float(np.clip(math.remainder(wanted - yaw, 2.0 * math.pi), -0.1, 0.1))
+        seen_rad.append(yaw)
+    return now_s + 0.1 * k, np.array(seen_rad)
 
 
-def test_tracking_loss_ends_a_side_look():
-    task, layer = FollowCorridor(), seen(stub, lambda x, y: (np.abs(y) > 0.9) & (x < 2.6))
-    before_a_wall(task, layer)
-    assert task.heading_rad(replace(state(0.3, 0.0, 25.0), tracked=False)) is None
-    assert task.heading_rad(state(0.3, 0.0, 25.1)) is None
-    assert place(task, layer, state(0.3, 0.0, 25.5)) == pytest.approx([2.4, 0.0], abs=0.1)
+def test_at_an_apparent_end_unknown_sides_are_viewed_and_then_it_ends():
+    task, layer = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (x < 2.6))
+    at_the_end(task, layer)
+    now_s, x, headings = 10.0, 2.4, []
+    assert task.result(state(x, stamp_s=9.0)) is None, "there may be a side corridor"
+    for _ in range(12):
+        now_s, turned = look(task, layer, now_s, x)
+        headings += turned.tolist()
+        found = layer.centres(task.goals(layer, state(x, 0.0, now_s))).reshape(-1, 2)
+        if (result := task.result(state(x, 0.0, now_s))) is not None:
+            break
+        assert np.linalg.norm(found - [2.4, 0.0], axis=1).max() < 3.5, "near the end only"
+        x = float(found[np.abs(found[:, 0] - x).argmin(), 0])
+    assert abs(x - 2.4) < 0.4 and result.reached and result.reason == "the corridor ends"
+    assert max(headings) > 1.2, "the left side is unknown"
 
 
 def test_narrowed_mouth_is_entered_unless_it_is_a_door():
@@ -241,94 +220,21 @@ def test_narrowed_mouth_is_entered_unless_it_is_a_door():
     for candidates, exits, flies in (([], [], True), ([may_be], [], True), ([], [door], False)):
         task = FollowCorridor()
         task.consider(candidates, exits)
-        for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-            found = task.goals(layer, state(x, 0.0, 0.5 * k))
-        assert bool((layer.centres(found)[:, 1] > 1.6).any()) is flies
+        assert bool((at_the_end(task, layer)[:, 1] > 1.6).any()) is flies
 
 
-def test_closed_side_opening_leads_back_to_the_end():
-    """An opening four metres back that turns out closed."""
-    task, hole = FollowCorridor(), seen(lambda x, y: sides(end=3.0)(x, y) & ~((np.abs(x + 1.0) < 0.9) & (y > 0.0)))
-    closed = seen(sides(end=3.0))
-    hole = Layer(hole.free & closed.free, hole.solid, hole.corner_w, hole.cell_m)
-    for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-        found = task.goals(hole, state(x, 0.0, 0.5 * k))
-    assert hole.centres(found)[0] == pytest.approx([-1.0, 1.2], abs=0.2)
-    for x in (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0):
-        task.goals(hole, state(x, 0.0, 12.0 - x))
-    assert place(task, closed, state(-1.0, 0.0, 14.0)) == pytest.approx([2.4, 0.0], abs=0.1)
-    for k in range(6):  # slowly: a place that it comes to is not looked at in vain
-        assert place(task, closed, state(1.3 + 0.1 * k, 0.0, 16.0 + k)) == pytest.approx([2.4, 0.0], abs=0.1)
-        assert not task.done(state(1.3 + 0.1 * k, 0.0, 16.0 + k))
-    assert len(task.goals(closed, state(2.2, 0.0, 24.0))) == 0, "a turn on the spot"
-    assert not task.done(state(2.2, 0.0, 36.0))
-    assert len(task.goals(closed, state(2.2, 0.0, 36.6))) == 0 and task.done(state(2.2, 0.0, 36.6))
-
-
-def test_end_is_the_same_after_a_return():
-    """The second apparent end is 0.4 m from the first."""
-    task, hole = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
-    shorter = seen(lambda x, y: sides(end=2.6)(x, y))
-    for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-        task.goals(hole, state(x, 0.0, 0.5 * k))
-    for k, x in enumerate((2.0, 1.0, 0.5)):
-        task.goals(hole, state(x, 0.0, 10.0 + k))
-    assert place(task, seen(sides(end=5.6)), state(0.0, 0.0, 13.0))[0] > 4.0, "there is more to it than it seemed"
-    assert place(task, shorter, state(1.9, 0.0, 15.0)) == pytest.approx([2.4, 0.0], abs=0.1)
-    assert len(task.goals(shorter, state(2.2, 0.0, 16.0))) == 0
-
-
-def test_unreachable_end_ends_the_task():
-    task, layer = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
-    for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-        task.goals(layer, state(x, 0.0, 0.5 * k))
-    lose(task, state(1.0, 0.0, 9.0))
-    assert place(task, layer, state(1.0, 0.0, 13.0)) == pytest.approx([2.4, 0.0], abs=0.1)
-    assert not task.done(state(1.0, 0.0, 13.0))
-    task.goals(layer, state(1.0, 0.0, 34.0))
-    assert task.done(state(1.0, 0.0, 34.0))
-
-
-def lose(task, at):
-    """The pose, for the third time, at a place."""
-    for k in range(3):
-        assert not task.done(replace(at, stamp_s=at.stamp_s + k))
-        task.done(replace(at, stamp_s=at.stamp_s + k + 0.5, tracked=False, overridden=True))
-
-
-def test_bare_wall_with_tracking_losses_ends_the_task():
-    """The task is done, not stuck."""
-    task, layer = FollowCorridor(), seen(stub, lambda x, y: (np.abs(y) > 0.9) & (x < 2.6))
-    for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-        task.goals(layer, state(x, 0.0, 0.5 * k))
-    lose(task, state(1.9, 0.0, 9.0))
-    assert task.done(state(1.9, 0.0, 12.0)) and task.wall
-
-
-def test_tracking_loss_in_a_side_opening_leads_back_to_the_end():
-    """The end is reached only there, not at the side opening."""
-    task, layer = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
-    for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-        found = task.goals(layer, state(x, 0.0, 0.5 * k))
-    assert layer.centres(found)[0] == pytest.approx([0.0, 1.2], abs=0.2)
-    lose(task, state(0.0, 0.0, 9.0))
-    assert place(task, layer, state(0.0, 0.0, 12.0)) == pytest.approx([2.4, 0.0], abs=0.1)
-    assert not task.done(state(0.0, 0.0, 12.0))
-    task.goals(layer, state(1.6, 0.0, 15.0))
-    assert task.done(state(1.6, 0.0, 15.0))
-
-
-def test_space_before_the_wall_is_no_continuation():
-    """Otherwise the drone oscillates between a side opening and a last step to the wall."""
-    layer, mouth = seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0)), pytest.approx([0.0, 1.2], abs=0.2)
-    task, to_its_end = FollowCorridor(), [(x, 0.0) for x in np.arange(-4.0, 2.5, 0.4)]
-    assert follow(task, layer, *to_its_end) == mouth
-    assert place(task, layer, state(1.9, 0.0, 12.0)) == mouth
+def test_a_side_corridor_that_a_view_shows_is_followed():
     task = FollowCorridor()
-    assert follow(task, layer, *to_its_end[:-1])[0] > 2.3
-    for k in range(12):
-        found = task.goals(layer, state(2.0, 0.0, 10.0 + 0.5 * k))
-    assert layer.centres(found)[0] == mouth, "it comes no nearer to the wall"
+    at_the_end(task, seen(stub, lambda x, y: (y > 0.9) & (x < 2.6)))
+    assert place(task, seen(stub), state(2.3, 0.0, 20.0))[1] > 1.6
+
+
+def test_a_bare_wall_at_the_end_is_not_viewed_for_ever():
+    task, layer = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (x < 2.6))
+    at_the_end(task, layer)
+    assert task.result(state(2.4, stamp_s=9.0), losses=2) is None
+    result = task.result(state(2.4, stamp_s=9.0), losses=3)
+    assert result.reached and task.wall
 
 
 def test_it_moves_with_the_map():
@@ -343,18 +249,18 @@ def test_it_moves_with_the_map():
         views.correct(moved(0, to))
         there = seen(lambda x, y: shape(x, y - 2.0))  # noqa: B023
         found = there.centres(task.goals(there, state(2.4, 2.0, 30.0)))
-        assert (found[:, 1] > left_m).all() if math.isfinite(left_m) else len(found) == 0
+        assert (found[:, 1] > left_m).all() if math.isfinite(left_m) else len(task._end)
 
 
 def test_a_corridor_ends_in_a_room():
     task, room = FollowCorridor(), seen(lambda x, y: np.maximum(np.abs(x), np.abs(y)) > 2.5)
     for k in range(5):
         task.goals(room, state(0.3 * k - 0.6, stamp_s=k))
-        done = task.done(state(0.3 * k - 0.6, stamp_s=k))
-    assert not done, "a metre must have been flown: a take-off in a room is no corridor's end"
+        done = task.result(state(0.3 * k - 0.6, stamp_s=k))
+    assert done is None, "a metre must have been flown: a take-off in a room is no corridor's end"
     task.goals(room, state(0.6, stamp_s=5.0))
     task.goals(room, state(0.6, stamp_s=8.0))
-    assert task.done(state(0.6, stamp_s=8.0)) and task.room
+    assert task.result(state(0.6, stamp_s=8.0)).reason == "the corridor opens into a room"
 
 
 def test_unknown_space_beside_the_path_is_no_continuation():
@@ -363,4 +269,5 @@ def test_unknown_space_beside_the_path_is_no_continuation():
     task = FollowCorridor()
     assert place(task, layer, state(0.0))[0] > 3.0
     task.goals(layer, state(3.2, stamp_s=5.0))
-    assert len(task.goals(layer, state(3.3, stamp_s=5.5))) == 0
+    task.goals(layer, state(3.3, stamp_s=5.5))
+    assert len(task._end)

@@ -109,7 +109,7 @@ def test_two_hypotheses_make_a_candidate_but_no_exit():
         watch.look(walls(), DroneState(0.5 * k, np.array([0.5, 0.0, HEIGHT_M]), 0.0, np.zeros(3), view=view))
     (candidate,) = watch.candidates
     assert candidate.centre_w == pytest.approx([2.0, 0.0], abs=0.12)
-    assert len(candidate.told_w) == 0, "rays alone do not tell all"
+    assert len(candidate.saturated_w) == 0, "rays alone do not saturate a viewpoint"
     assert watch.exits == ()
     for k in range(4, 12):
         here = np.array([0.5 if k < 8 else 1.1, 0.0, HEIGHT_M])

@@ -17,8 +17,9 @@ from edgeslam_torch.navigation.openings.exits import openings
 from edgeslam_torch.navigation.openings.pathways import pathways
 from edgeslam_torch.navigation.openings.wall_frame import Walls, along_walls, wall_directions
 from edgeslam_torch.navigation.pilot import Pilot
+from edgeslam_torch.navigation.skills.explore import Explore
+from edgeslam_torch.navigation.skills.go_to import GoTo
 from edgeslam_torch.navigation.space import Space
-from edgeslam_torch.navigation.tasks import Explore, GoTo
 
 ANGLES = [0.0, 0.3, math.pi / 4, 1.9]
 HERE = np.zeros(2)
@@ -148,7 +149,7 @@ def test_one_viewpoint_makes_a_candidate_two_an_exit():
     (candidate,) = watched([0.0] * 8, walls).candidates
     assert candidate.centre_w == pytest.approx([2.0, 0.0], abs=0.12)
     assert abs(candidate.normal_w[0]) == pytest.approx(1.0, abs=0.05)
-    assert candidate.told_w == pytest.approx(np.zeros((1, 2)))
+    assert candidate.saturated_w == pytest.approx(np.zeros((1, 2)))
     assert watched([0.0, 0.1, 0.2, 0.6], walls).candidates == ()
     assert watched([0.0] * 8, surroundings(PILLARS)).candidates == (), "what can be passed by"
 
@@ -403,9 +404,9 @@ def test_what_a_wall_parts_is_not_reachable():
 def test_upright_is_what_fills_the_height():
     space = Space()
     for z in np.arange(0.05, 2.3, 0.1):
-        space.points(np.array([[1.05, 0.05, z]]))
+        space.mark(np.array([[1.05, 0.05, z]]))
         if z < 0.9:
-            space.points(np.array([[2.05, 0.05, z]]))
+            space.mark(np.array([[2.05, 0.05, z]]))
     upright = space.upright(0.7, 1.5, 0.7)
     layer = space.layer(1.15, 0.15)
     assert upright[tuple(layer.cells(np.array([1.05, 0.05])))]
@@ -470,26 +471,26 @@ def test_the_pilot_takes_what_is_low_for_no_wall():
     pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
     for y in np.arange(-0.95, 1.0, 0.1):
         for z in np.arange(0.05, 2.0, 0.1):
-            pilot.space.points(np.array([[1.05, y, z]]))
-        pilot.space.points(np.array([[2.05, y, 1.15], [2.05, y, 1.05]]))
+            pilot.space.mark(np.array([[1.05, y, z]]))
+        pilot.space.mark(np.array([[2.05, y, 1.15], [2.05, y, 1.05]]))
     walls = pilot.walls()
     first, second = (tuple(walls.layer.cells(np.array([x, 0.05]))) for x in (1.05, 2.05))
     assert walls.layer.solid[first] and walls.layer.solid[second]
     assert walls.upright[first] and not walls.upright[second]
 
 
-def test_the_pilot_tells_its_task_of_candidates(monkeypatch):
+def test_the_pilot_tells_its_skill_of_candidates(monkeypatch):
     monkeypatch.setattr(Pilot, "walls", lambda self: surroundings(wall(0.9)))
     task = Explore()
     pilot = Pilot(task)
     pilot.exits = watched([0.0] * 8, surroundings(wall(0.9)))
     pilot.update(state(0.0, stamp_s=9.0, view=VIEW))
     assert pilot.exits.candidates
-    assert task.heading_rad(state(1.0, stamp_s=9.1)) is not None, "it looks around first"
+    assert task.look_rad(state(1.0, stamp_s=9.1)) is not None, "it looks around first"
     assert len(task.goals(surroundings(wall(0.9)).layer, state(-1.0, stamp_s=9.2)))
 
 
-def test_the_pilot_tells_its_task_of_exits(monkeypatch):
+def test_the_pilot_tells_its_skill_of_exits(monkeypatch):
     monkeypatch.setattr(Pilot, "walls", lambda self: surroundings(wall(0.9)))
     told = []
 

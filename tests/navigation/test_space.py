@@ -109,6 +109,15 @@ def test_path_flown_is_free():
     assert not cell(layer, 1.0, 0.5)[0]
 
 
+@pytest.mark.parametrize(("hits", "stays_free"), [(2, True), (3, False)])
+def test_single_hits_do_not_occupy_where_the_body_passed(hits, stays_free):
+    space = Space()
+    space.flown(np.array([2.0, 0.0, 1.15]), 0.2)
+    for k in range(hits):
+        space.observe(facing_a_wall(2.05, picture=k))
+    assert cell(space.layer(1.15, 0.05), 2.05, 0.05) == (stays_free, not stays_free)
+
+
 def test_grid_follows_map_corrections():
     space = Space()
     seen(space)
@@ -169,7 +178,7 @@ def test_grid_follows_the_drone():
 def test_points_of_the_map_are_solid():
     space = Space()
     seen(space)
-    space.points(np.array([[1.05, 0.05, 1.15]]))
+    space.mark(np.array([[1.05, 0.05, 1.15]]))
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 1.05, 0.05) == (False, True)
 

@@ -12,7 +12,7 @@ from edgeslam_torch.navigation.exploring.view_planner import ViewPlanner, _in_tu
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import MapViews
 from edgeslam_torch.navigation.openings.exit_tracker import Candidate
-from edgeslam_torch.navigation.tasks import Explore
+from edgeslam_torch.navigation.skills.explore import Explore
 
 
 def at(now_s, x, yaw_deg, tracked=True):
@@ -189,7 +189,7 @@ def test_viewpoints_are_before_an_opening_and_away_from_those_that_told():
     assert before.min() >= 0.8
     assert before.max() <= 2.0, "on the side from which it was seen, and not from afar"
     assert (np.abs(places[:, 1]) <= 0.3 * before).all(), "not along the wall"
-    assert np.linalg.norm(places - DOOR.told_w[0], axis=1).min() >= 0.6
+    assert np.linalg.norm(places - DOOR.saturated_w[0], axis=1).min() >= 0.6
 
 
 def test_unreachable_viewpoints_are_excluded():
@@ -265,9 +265,9 @@ def test_exploration_covers_every_wall_and_ends():
     task, layer, x, y, yaw = Explore(), plain(5.0), 2.0, 0.0, 0.0
     for now_s in np.arange(0.0, 400.0, 0.1):
         state = DroneState(now_s, np.array([x, y, 1.15]), yaw, np.zeros(3))
-        if task.done(state):
+        if task.result(state):
             break
-        if (heading := task.heading_rad(state)) is not None:
+        if (heading := task.look_rad(state)) is not None:
             yaw += float(np.clip(math.remainder(heading - yaw, 2.0 * math.pi), -0.1, 0.1))
         elif len(found := goals(task, layer, x, y, now_s)):
             x, y = found[np.argmin(np.hypot(*(found - [x, y]).T))]
@@ -299,5 +299,5 @@ def test_exploring_goes_on_while_there_is_an_opening_to_look_at():
             goes_on.consider([DOOR])
         ends.goals(known, beside(0.5, 1.0, now_s))
         assert len(goes_on.goals(known, beside(0.5, 1.0, now_s))) == 0 or now_s >= 5.0
-    assert ends.done(beside(0.5, 1.0, 20.0))
-    assert not goes_on.done(beside(0.5, 1.0, 20.0))
+    assert ends.result(beside(0.5, 1.0, 20.0))
+    assert not goes_on.result(beside(0.5, 1.0, 20.0))

@@ -199,7 +199,7 @@ def _plan(args: argparse.Namespace, limits: "NavLimits") -> list[str]:
         what = f"follow the corridor for at most {args.seconds:g} s, until it ends or opens into a room"
     elif args.verb == "exit":
         what = f"explore for at most {args.seconds:g} s until an exit is found, and fly through it"
-    steps = [f"take off, rise to {limits.height_m:.2f} m and look to both sides", what]
+    steps = [f"take off and rise to {limits.height_m:.2f} m", what]
     steps += ["return above the take-off"] if args.back and args.verb != "home" else []
     lines = [f"{n}. {step}" for n, step in enumerate([*steps, "land"], 1)]
     return [

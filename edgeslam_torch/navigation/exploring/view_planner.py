@@ -1,7 +1,8 @@
-"""View planner of exploration: viewpoints and headings by what a view would tell.
+"""View planner of exploration: viewpoints and headings by the information expected of a view.
 
-A view tells about borders of the free space that no view has covered frontally, where a door may be, and about openings
-that are undecided: from a single viewpoint they are indistinguishable from a gap between two objects or a depth error.
+A view is informative about borders of the free space that no view has covered frontally, where a door may be, and about
+openings that are undecided: from a single viewpoint they are indistinguishable from a gap between two objects or a
+depth error.
 """
 
 import math
@@ -20,11 +21,9 @@ from edgeslam_torch.navigation.openings.exit_tracker import FIELD_RAD, PLACES_M,
 from edgeslam_torch.types import FloatArray
 
 _EVERY_M = 1.2
-"""Distance between looks along the path: a door of 0.85 m is seen from two places."""
+"""Distance between looks around: a door of 0.85 m is seen from two places."""
 _ON_THE_WAY_M = 1.2
 """Distance of a viewpoint before an opening that is no detour."""
-_AGAIN_M = 0.4
-"""Distance from an earlier look below which nothing new is visible."""
 _THERE_M = 0.25
 """Distance that counts as arrived; the planner comes no closer."""
 _WORTH_M = 0.6
@@ -57,19 +56,17 @@ _SOUGHT_S = 30.0
 
 @dataclass(slots=True)
 class ViewPlanner:
-    """Proposes viewpoints and headings until no view would tell anything."""
+    """Proposes viewpoints and headings until no view would be informative."""
 
     _coverage: Coverage = field(default_factory=Coverage)
     _left: Borders = field(default_factory=lambda: Borders(np.zeros((0, 2)), np.zeros((0, 2)), 0.0))
     """Borders not covered at the last call."""
     _openings: Sequence[Candidate] = ()
     """Undecided openings."""
-    _spots_w: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    """``(G, 2)`` viewpoints for borders."""
     _places: Places = field(default_factory=Places)
     """Positions of earlier looks around."""
     _spent: Places = field(default_factory=Places)
-    """Viewpoints before openings that told nothing more, or that were not reached."""
+    """Viewpoints before openings that yielded nothing more, or that were not reached."""
     _headings: list[float] = field(default_factory=list)
     """Remaining headings, last first."""
     _since_s: float = math.nan
@@ -79,24 +76,38 @@ class ViewPlanner:
     _sought_s: float = math.nan
     """Since when a viewpoint before an opening is sought."""
 
+    @property
+    def looks(self) -> bool:
+        """Whether a look is under way."""
+        return bool(self._headings)
+
     def consider(self, openings: Sequence[Candidate]) -> None:
         """Set the undecided openings."""
         self._openings = openings
 
-    def goals(self, layer: Layer, state: DroneState, frontier: np.ndarray) -> np.ndarray:
-        """Viewpoint cells ``(G, 2)``: those before openings close by, else all, with those ``(F, 2)`` at a frontier."""
+    def goals(
+        self, layer: Layer, state: DroneState, frontier: np.ndarray, among: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Viewpoint cells ``(G, 2)``: those before openings close by, else all, with those ``(F, 2)`` at a frontier.
+
+        Args:
+            layer: Current layer.
+            state: Current state.
+            frontier: Cells at a frontier.
+            among: Cells ``(M, 2)`` that may be viewpoints; all free ones when None.
+        """
         here = state.p_w[:2]
         self._left = self._coverage.unlooked(borders(layer, here))
-        free = layer.free & (layer.from_solid_m > _PASSED_M)
-        cells = reachable(np.argwhere(free), layer, here)
+        free = np.argwhere(layer.free & (layer.from_solid_m > _PASSED_M)) if among is None else among
+        cells = reachable(free, layer, here)
         p_w = layer.centres(cells).reshape(-1, 2)
-        tells = self._tells(p_w, _INSIDE_M)
-        near = tells & (np.linalg.norm(p_w - here, axis=1) <= _ON_THE_WAY_M)
-        self._seek(p_w[tells], state)
+        informative = self._informative(p_w, _INSIDE_M)
+        near = informative & (np.linalg.norm(p_w - here, axis=1) <= _ON_THE_WAY_M)
+        self._seek(p_w[informative], state)
         if near.any():
             return np.asarray(cells[near])
         coarse = cells[(cells % _COARSE == 0).all(1)]
-        return np.concatenate([frontier, cells[tells], self._before_borders(coarse, layer, here)])
+        return np.concatenate([frontier, cells[informative], self._before_borders(coarse, layer, here)])
 
     def heading_rad(self, state: DroneState) -> float | None:
         """Heading to turn to; None to face ahead. A tracking loss ends the look."""
@@ -119,16 +130,16 @@ class ViewPlanner:
             self._headings.pop()
         return self._headings[-1] if self._headings else None
 
-    def _tells(self, p_w: FloatArray, inside_m: float = 0.0) -> np.ndarray:
-        """``(P,)`` whether a view from points ``(P, 2)`` would tell about an opening."""
-        told = [_tells(opening, p_w, inside_m) for opening in self._openings]
-        return np.any(told, axis=0) & (self._spent.away_m(p_w) > _AGAIN_M) if told else np.zeros(len(p_w), bool)
+    def _informative(self, p_w: FloatArray, inside_m: float = 0.0) -> np.ndarray:
+        """``(P,)`` whether a view from points ``(P, 2)`` is informative about an opening."""
+        seen = [_informative(opening, p_w, inside_m) for opening in self._openings]
+        return np.any(seen, axis=0) & (self._spent.away_m(p_w) >= PLACES_M) if seen else np.zeros(len(p_w), bool)
 
     def _opening_at(self, here_w: FloatArray) -> Candidate | None:
-        """An opening about which a view from here would tell."""
-        if not self._tells(here_w[None])[0]:
+        """An opening about which a view from here is informative."""
+        if not self._informative(here_w[None])[0]:
             return None
-        return next(opening for opening in self._openings if _tells(opening, here_w[None])[0])
+        return next(opening for opening in self._openings if _informative(opening, here_w[None])[0])
 
     def _seek(self, spots_w: FloatArray, state: DroneState) -> None:
         """Give up the nearest viewpoint before an opening if none was reached for long."""
@@ -145,7 +156,7 @@ class ViewPlanner:
         """Some of the cells, greedily by the uncovered border length that each adds."""
         p_w = layer.centres(cells).reshape(-1, 2)
         away = np.linalg.norm(p_w - here, axis=1)
-        shown = self._left.before(p_w) & (self._places.away_m(p_w) > _AGAIN_M)[:, None]
+        shown = self._left.before(p_w) & (self._places.away_m(p_w) > _EVERY_M)[:, None]
         chosen: list[int] = []
         while len(cells) and len(chosen) < _MOST:
             gain_m = shown.sum(1) * self._left.cell_m
@@ -154,16 +165,12 @@ class ViewPlanner:
                 break
             chosen.append(best)
             shown &= ~shown[best]
-        self._spots_w = p_w[chosen]
         return np.asarray(cells[chosen])
 
     def _is_new(self, here_w: FloatArray) -> bool:
-        """Whether to look from here: far enough from earlier looks with enough to see, or at a viewpoint."""
-        away_m = float(self._places.away_m(here_w))
-        if away_m > _EVERY_M:
-            return bool(self._left.before(here_w[None]).sum() * self._left.cell_m >= _WORTH_M)
-        there = (np.linalg.norm(self._spots_w - here_w, axis=1) < _THERE_M).any()
-        return bool(there) and away_m > _AGAIN_M - _THERE_M
+        """Whether to look from here: far enough from earlier looks, with enough to see."""
+        far = float(self._places.away_m(here_w)) > _EVERY_M - _THERE_M
+        return far and bool(self._left.before(here_w[None]).sum() * self._left.cell_m >= _WORTH_M)
 
     def _sides(self, here_w: FloatArray, yaw_rad: float) -> list[float]:
         """Turns from the current heading that cover the borders visible from here, greedily."""
@@ -181,13 +188,13 @@ class ViewPlanner:
         return found
 
 
-def _tells(opening: Candidate, p_w: FloatArray, inside_m: float = 0.0) -> np.ndarray:
+def _informative(opening: Candidate, p_w: FloatArray, inside_m: float = 0.0) -> np.ndarray:
     """``(P,)`` whether an opening is visible from points ``(P, 2)`` on the side from which it was detected, at least
-    ``inside_m`` inside this region, and away from viewpoints that have told all they can."""
+    ``inside_m`` inside this region, and away from saturated viewpoints."""
     before = (opening.centre_w - p_w) @ opening.normal_w
     aside = np.abs((p_w - opening.centre_w) @ np.array([-opening.normal_w[1], opening.normal_w[0]]))
     apart = (before >= _BEFORE_M[0] + inside_m) & (before <= _BEFORE_M[1] - inside_m)
-    fresh = np.linalg.norm(p_w[:, None] - opening.told_w, axis=-1).min(axis=1, initial=math.inf)
+    fresh = np.linalg.norm(p_w[:, None] - opening.saturated_w, axis=-1).min(axis=1, initial=math.inf)
     return np.asarray(apart & (aside <= _ASIDE * before - inside_m) & (fresh >= PLACES_M + inside_m))
 
 

@@ -82,8 +82,8 @@ class Candidate:
     """``(2,)`` [m]."""
     normal_w: FloatArray
     """``(2,)`` unit normal, away from the first viewpoint."""
-    told_w: FloatArray
-    """``(N, 2)`` viewpoints whose views have told all they can [m]."""
+    saturated_w: FloatArray
+    """``(N, 2)`` viewpoints whose evidence has reached its bound [m]."""
 
 
 class _Track:
@@ -158,8 +158,8 @@ class _Track:
         return sum(log_odds > 0.0 for log_odds in self._evidence)
 
     @property
-    def told_w(self) -> FloatArray:
-        """``(N, 2)`` viewpoints whose views have told all they can."""
+    def saturated_w(self) -> FloatArray:
+        """``(N, 2)`` viewpoints whose evidence has reached its bound."""
         return self.viewpoints.p_w[np.abs(self._evidence) >= _VIEWPOINT]
 
 
@@ -214,7 +214,7 @@ class ExitTracker:
                 if track.parts > 0.0 and not any(_one_passage(_exit(track, state), other) for other in found):
                     found.append(_exit(track, state))
             elif not round_:
-                undecided.append(Candidate(track.centre_w, track.normal_w, track.told_w))
+                undecided.append(Candidate(track.centre_w, track.normal_w, track.saturated_w))
         self.exits = tuple(sorted(found, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - state.p_w[:2]))))
         self.candidates = tuple(undecided)
 

@@ -1,4 +1,4 @@
-"""Behaviours: sequences of tasks with success criteria."""
+"""Behaviours: sequences of skills with success criteria."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -6,10 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.eval.judge.navigation.flown import Flown
-from edgeslam_torch.flying.tasks import WayHome
-from edgeslam_torch.navigation.corridor.follow import FollowCorridor
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
-from edgeslam_torch.navigation.tasks import Explore, GoTo, Task
+from edgeslam_torch.navigation.skills.explore import Explore
+from edgeslam_torch.navigation.skills.follow_corridor import FollowCorridor
+from edgeslam_torch.navigation.skills.go_to import GoTo
+from edgeslam_torch.navigation.skills.return_home import ReturnHome
+from edgeslam_torch.navigation.skills.skill import Skill
 from edgeslam_torch.synthetic.sites.site import Site, TrueExit
 from edgeslam_torch.types import FloatArray
 
@@ -26,7 +28,7 @@ _SAME_EXIT_M, _SAME_EXIT_COS = 0.5, np.cos(np.radians(35.0))
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """State at the start of a task."""
+    """State at the start of a skill."""
 
     site: Site
     clock_s: float
@@ -38,20 +40,20 @@ class Moment:
 
 @dataclass(frozen=True, slots=True)
 class Behaviour:
-    """Tasks and their success criterion."""
+    """Skills and their success criterion."""
 
-    steps: tuple[Callable[[Moment], Task], ...]
+    steps: tuple[Callable[[Moment], Skill], ...]
     reached: Callable[[Flown, Site], bool]
-    """Whether a flight that completed its last task without contact reached its goal."""
+    """Whether a flight that completed its last skill without contact reached its goal."""
     limit_s: float = 120.0
 
 
-def _goal(moment: Moment) -> Task:
+def _goal(moment: Moment) -> Skill:
     return GoTo(moment.site.goal_w / moment.scale)
 
 
-def _home(moment: Moment) -> Task:
-    return WayHome(moment.track_w)
+def _home(moment: Moment) -> Skill:
+    return ReturnHome(moment.track_w)
 
 
 def _at_home(flown: Flown, site: Site) -> bool:
@@ -85,8 +87,8 @@ def corridor_ends(site: Site) -> list[FloatArray]:
 BEHAVIOURS = {
     "goto": Behaviour((_goal,), lambda flown, site: flown.distance_m < REACHED_M),
     "home": Behaviour((_goal, _home), _at_home, 240.0),
-    "corridor": Behaviour((lambda moment: FollowCorridor(moment.clock_s + FOLLOWED_S),), _at_an_end, 160.0),
-    "exits": Behaviour((lambda moment: Explore(moment.clock_s + EXPLORED_S), _home), _at_home, 420.0),
+    "corridor": Behaviour((lambda moment: FollowCorridor(until_s=moment.clock_s + FOLLOWED_S),), _at_an_end, 160.0),
+    "exits": Behaviour((lambda moment: Explore(until_s=moment.clock_s + EXPLORED_S), _home), _at_home, 420.0),
 }
 """By name; ``exits`` explores for `EXPLORED_S` and returns home, and the exits found are scored, too."""
 

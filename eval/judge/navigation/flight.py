@@ -109,7 +109,7 @@ def is_beyond(state: DroneState, p_w: FloatArray) -> bool:
 
 
 class _Tasks:
-    """Gives the flight controller one task after the other, however the previous one ended."""
+    """Gives the flight controller one skill after the other, however the previous one ended."""
 
     def __init__(self, site: Site, behaviour: Behaviour, flight_controller: FlightController, scale: float) -> None:
         self.flight_controller, self.limit_s = flight_controller, behaviour.limit_s
@@ -117,15 +117,15 @@ class _Tasks:
         self._first = True
 
     def go_on(self, now_s: float) -> None:
-        """Set the next task when the current one has ended; the first is set during the initial look around."""
-        if self._steps and (self._first or self.flight_controller.ended() is not None):
+        """Set the next skill when the current one has ended; the first is set during the climb."""
+        if self._steps and (self._first or self.flight_controller.result() is not None):
             step = self._steps.pop(0)
             self.flight_controller.begin(step(Moment(self._site, now_s, self._scale, self.flight_controller.track())))
             self._first = False
 
     def over(self) -> bool:
         """Whether all tasks have ended."""
-        return self.flight_controller.ended() is not None and not self._steps
+        return self.flight_controller.result() is not None and not self._steps
 
 
 @dataclass(slots=True)
@@ -173,7 +173,7 @@ def _fly(
             dangers[str(order.danger)] = None
         landing = tasks.over() or order.land
         if landing:
-            found.ended, found.time_s = str(controller.ended() if tasks.over() else order.danger), tello.clock_s
+            found.ended, found.time_s = str(controller.pilot.phase if tasks.over() else order.danger), tello.clock_s
             tello.send("land")
         else:
             right, forward, up, clockwise = (round(100 * v) for v in order.command.sticks())

@@ -14,7 +14,7 @@ from edgeslam_torch.flying.perception import slam_perception
 from edgeslam_torch.geometry.camera import PRESETS, Camera
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.drone_state import DroneState, View
-from edgeslam_torch.synthetic.house.render import render
+from edgeslam_torch.synthetic.house.render import depth_map
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
 
@@ -130,7 +130,7 @@ def nothing_painted(T_w_b: np.ndarray) -> np.ndarray:
 def true_depth(site: Site, picture: Picture, size: tuple[int, int]) -> FloatArray:
     """Exact z-depth ``(H, W)`` [m] of a picture."""
     T_site_c = site.T_site_w @ picture.T_w_b @ camera_on_body()
-    return render(site.painted(picture.captured_s), PRESETS["tello"].scaled(*size), T_site_c, antialias=False).depth_m
+    return depth_map(site.painted(picture.captured_s), PRESETS["tello"].scaled(*size), T_site_c)
 
 
 def near_counts(view: View, true_m: FloatArray) -> np.ndarray:

@@ -8,7 +8,7 @@ import pytest
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import PRESETS, Camera
-from edgeslam_torch.synthetic.house.render import picture, render
+from edgeslam_torch.synthetic.house.render import depth_map, picture, render
 from edgeslam_torch.synthetic.house.views import look, random_pose
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
 from edgeslam_torch.synthetic.sites.build import place
@@ -115,8 +115,8 @@ def test_world_without_quads_is_refused():
         World([])
 
 
-def test_a_picture_is_the_image_of_a_view_with_plain_borders(furnished):
+def test_a_picture_and_a_depth_map_are_those_of_a_view_with_plain_borders(furnished):
     T_w_c = random_pose(np.random.default_rng(5), furnished)
-    np.testing.assert_array_equal(
-        picture(furnished, CAMERA, T_w_c), render(furnished, CAMERA, T_w_c, antialias=False).image
-    )
+    plain = render(furnished, CAMERA, T_w_c, antialias=False)
+    np.testing.assert_array_equal(picture(furnished, CAMERA, T_w_c), plain.image)
+    np.testing.assert_array_equal(depth_map(furnished, CAMERA, T_w_c), plain.depth_m)

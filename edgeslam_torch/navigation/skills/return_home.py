@@ -1,4 +1,4 @@
-"""Tasks of a flight beside those of `navigation.tasks`: hover, and return home."""
+"""Skill: return to the take-off."""
 
 import math
 from dataclasses import dataclass, field
@@ -8,12 +8,10 @@ import numpy as np
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
-from edgeslam_torch.navigation.tasks import LooksAhead
+from edgeslam_torch.navigation.skills.go_to import ARRIVED_M, SLOW_M_S
+from edgeslam_torch.navigation.skills.skill import Result, Skill
 from edgeslam_torch.types import FloatArray
 
-HOME_M = 0.15
-"""Distance from the take-off that counts as home."""
-_SLOW_M_S = 0.15
 _LOOK_M, _LOOK_S = 0.6, 3.0
 """Distance from the take-off at which the drone takes its initial heading, and duration of the look: enough for two
 keyframes, a loop closure and a view at the new scale."""
@@ -21,27 +19,12 @@ _LOST_M = 1.5
 """The same after a tracking loss this close, as by a bare wall behind the take-off."""
 _AHEAD_RAD = math.radians(8.0)
 _GIVEN_UP_S = 12.0
-"""Timeout of turn and look: half a turn at a third of the nominal rate, plus the look."""
-_FACES_S = 12.0
-"""Time in which the drone flies the last metre slowly with that heading; turning would switch to another part of the
-map with another drift."""
-
-
-@dataclass(frozen=True, slots=True)
-class Stay(LooksAhead):
-    """Rise, look around and hover."""
-
-    def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """The current cell."""
-        return layer.cells(state.p_w[:2])[None]
-
-    def done(self, state: DroneState) -> bool:
-        """Always: it is only called at the flight height."""
-        return True
+"""Timeout of turn and look, half a turn at a third of the nominal rate plus the look; and time in which the drone flies
+the last metre slowly with that heading, since turning would switch to another part of the map with another drift."""
 
 
 @dataclass(slots=True)
-class WayHome(LooksAhead):
+class ReturnHome(Skill):
     """Fly to the take-off; along the path flown while the take-off lies beyond the grid.
 
     On the way back the camera faces the opposite direction and revisits nothing, so the map drifts by about 2 % of the
@@ -49,7 +32,7 @@ class WayHome(LooksAhead):
     """
 
     track_w: FloatArray
-    """``(N, 2)`` path flown up to the start of the task, oldest first [m]."""
+    """``(N, 2)`` path flown up to the start of the skill, oldest first [m]."""
     _track: Places = field(default_factory=Places)
     """The same as the map has it now, the take-off first."""
     _looked_s: float = math.inf
@@ -70,16 +53,14 @@ class WayHome(LooksAhead):
         oldest = points[int(np.argmax(held))] if held.any() else state.p_w[:2]
         return layer.cells(oldest)[None]
 
-    def done(self, state: DroneState) -> bool:
-        """Whether the drone is above the take-off, slow, and has looked with its initial heading."""
-        near = float(np.linalg.norm(state.p_w[:2])) < HOME_M
-        return state.stamp_s >= self._looked_s and near and float(np.linalg.norm(state.velocity_w)) < _SLOW_M_S
+    def result(self, state: DroneState, losses: int = 0) -> Result | None:
+        """Above the take-off, slow, and the look is over; losses do not end it, since there is no alternative."""
+        near, slow = np.linalg.norm(state.p_w[:2]) < ARRIVED_M, np.linalg.norm(state.velocity_w) < SLOW_M_S
+        if near and slow and state.stamp_s >= self._looked_s:
+            return Result(True, "home")
+        return Result(False, "the time is over") if state.stamp_s >= self.until_s else None
 
-    def gives_up(self, losses: int) -> bool:
-        """Never: there is no alternative."""
-        return False
-
-    def heading_rad(self, state: DroneState) -> float | None:
+    def look_rad(self, state: DroneState) -> float | None:
         """The heading of the take-off, 0, for `_LOOK_S` near the take-off."""
         away = float(np.linalg.norm(state.p_w[:2]))
         if not state.tracked and away < _LOST_M:
@@ -96,4 +77,4 @@ class WayHome(LooksAhead):
 
     def faces_rad(self, state: DroneState) -> float | None:
         """The same heading over the last metre."""
-        return 0.0 if 0.0 <= state.stamp_s - self._looked_s < _FACES_S else None
+        return 0.0 if 0.0 <= state.stamp_s - self._looked_s < _GIVEN_UP_S else None

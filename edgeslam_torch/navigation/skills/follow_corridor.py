@@ -1,4 +1,4 @@
-"""Task: follow a corridor around its corners until it ends or opens into a room."""
+"""Skill: follow a corridor around its corners until it ends or opens into a room."""
 
 import math
 from collections.abc import Sequence
@@ -6,56 +6,53 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from edgeslam_torch.navigation.contact.losses import Losses
 from edgeslam_torch.navigation.corridor.corridor_geometry import (
     SMEARED_BERTH_M,
     far_middle,
     is_ahead,
     is_walled,
-    mouths,
     straight,
     wide,
 )
-from edgeslam_torch.navigation.corridor.dead_end_scan import DeadEndScan
 from edgeslam_torch.navigation.corridor.trail import PASSED_M, Trail, aside
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.frontiers import Looks
+from edgeslam_torch.navigation.exploring.view_planner import ViewPlanner
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
-from edgeslam_torch.navigation.tasks import LooksAhead
+from edgeslam_torch.navigation.skills.skill import Result, Skill
 from edgeslam_torch.types import FloatArray
 
 _TURN_COST_M = 6.0
 """Cost of a turn by 180 degrees: corridors ahead are preferred to those that turn back."""
 _BLIND_M = 1.5
 """Distance of the goal ahead in unknown space."""
+_BACK_M = 2.3
+"""Distance from an apparent end from within which its sides are viewed: a corridor that turns off there was seen at
+a grazing angle in passing."""
+_AT_END_M = 0.4
 _ROOM_S = 2.0
 _MOST_LOSSES = 3
-"""Tracking losses before a bare wall at a corridor's end after which the scan is aborted."""
+"""Tracking losses before a bare wall at a corridor's end after which it is not viewed any more."""
 _SQUARE_COS = math.cos(math.radians(35.0))
 """A door whose normal is within 35 degrees of the corridor's direction lies across it."""
 
 
 @dataclass(slots=True)
-class FollowCorridor(LooksAhead):
+class FollowCorridor(Skill):
     """Follow the current corridor along its middle, through no known door."""
 
-    until_s: float = np.inf
-    """End time on the clock of the states."""
-    room: bool = False
-    """Whether it ended because the corridor opens into a room."""
     wall: bool = False
     """Whether an obstacle is close ahead; without one, a missing continuation is no end of the corridor."""
     _looks: Looks = field(default_factory=Looks)
+    _views: ViewPlanner = field(default_factory=ViewPlanner)
     _trail: Trail | None = None
-    _end: DeadEndScan | None = None
-    """Scan of the last apparent end."""
-    _ending: bool = False
-    """Whether the corridor appears to end now."""
-    _losses: Losses = field(default_factory=lambda: Losses(math.inf))
-    """Tracking losses at the apparent end."""
+    _end: Places = field(default_factory=Places)
+    """Apparent end of the corridor, if it appears to end now."""
+    _viewed: bool = False
+    """Whether no view of the apparent end is left, and the drone is back there."""
     _wide_s: float = math.nan
     _target: Places = field(default_factory=Places)
     """Current goal in a corridor that turns off."""
@@ -71,7 +68,7 @@ class FollowCorridor(LooksAhead):
 
     def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
         """Goal cells ``(G, 2)``: wide space ahead, else a corridor that turns off, else narrow space straight ahead,
-        else openings in the side walls before the end."""
+        else a side corridor through a narrowed mouth, else viewpoints of the sides before the end."""
         here = state.p_w[:2]
         self._trail = self._trail or Trail.beginning(state)
         self._trail.fly(state)
@@ -79,58 +76,59 @@ class FollowCorridor(LooksAhead):
         axis = self._trail.direction(layer, here)
         self.wall = is_walled(layer, here, axis)
         found = self._looks.worth(self._onward(layer, state, axis, self._trail), layer, state)
-        if len(found) or not self._ending or self._end is None:
+        if len(found) or not len(self._end):
             return found
-        goal = self._end.goal(layer, state)
-        return layer.cells(np.zeros((0, 2)) if goal is None else goal[None])
+        cells = wide(layer, here)
+        cells = cells[self._end.away_m(layer.centres(cells).reshape(-1, 2)) < _BACK_M]
+        spots = self._views.goals(layer, state, found, cells)
+        if len(spots) or self._views.looks:
+            return spots
+        self._viewed = self._end.is_near(here, _AT_END_M)
+        return spots if self._viewed else layer.cells(self._end.p_w)
 
-    def heading_rad(self, state: DroneState) -> float | None:
-        """Headings of the scan at an apparent end, else ahead."""
-        return self._end.heading_rad(state) if self._ending and self._end is not None else None
+    def look_rad(self, state: DroneState) -> float | None:
+        """Headings of the view planner at an apparent end, else ahead."""
+        return self._views.heading_rad(state) if len(self._end) else None
 
-    def done(self, state: DroneState) -> bool:
-        """Whether the corridor ended or the time is over."""
-        self.room = state.stamp_s - self._wide_s > _ROOM_S
-        return self.room or self._has_ended(state) or state.stamp_s >= self.until_s
-
-    def _has_ended(self, state: DroneState) -> bool:
-        if not self._ending or self._end is None:
-            return self._looks.over(state.stamp_s)
-        self._losses.note(state)
-        if self._losses.count >= _MOST_LOSSES:
-            self._end.give_up(state)
-        return self._end.over
+    def result(self, state: DroneState, losses: int = 0) -> Result | None:
+        """The corridor ended, or the drone has not flown a metre of one."""
+        ends = self._viewed or losses >= _MOST_LOSSES if len(self._end) else self._looks.over(state.stamp_s)
+        room = state.stamp_s - self._wide_s > _ROOM_S
+        result = super(FollowCorridor, self).result(state, losses)
+        if not (room or ends or result is not None):
+            return None
+        if self._trail is None or len(self._trail.places_w) < 2:
+            return Result(False, "there is no corridor to follow here")
+        if room:
+            return Result(True, "the corridor opens into a room")
+        if ends:
+            ended = Result(True, "the corridor ends")
+            return ended if len(self._end) else Result(False, "neither a continuation nor an end is visible")
+        return result
 
     def _onward(self, layer: Layer, state: DroneState, axis: FloatArray, trail: Trail) -> np.ndarray:
         here = state.p_w[:2]
         cells = self._left(layer, wide(layer, here))
         places = layer.centres(cells)
         if len(ahead := cells[is_ahead(places, here, axis) & trail.leads_on(places)]):
-            self._ending = False
+            self._end, self._viewed = Places(), False
             return far_middle(layer, ahead, axis)
         trail.end(state)
         if len(off := cells[trail.turns_off(places, here)]):
             return self._nearest(layer, off, state, axis)
         narrow = straight(layer, here, axis, self._to_door(here, axis))
-        if self._ending:  # space between here and the wall leads nowhere
+        if len(self._end):  # space between here and the wall leads nowhere
             narrow = narrow[trail.leads_on(layer.centres(narrow))]
         if len(narrow := self._left(layer, far_middle(layer, narrow, axis))):
             return narrow
-        if not self.wall and not self._ending:
+        if not self.wall and not len(self._end):
             return layer.cells(here + _BLIND_M * axis)[None]
-        if self._end is None or not (self._ending or self._end.is_near(here)):
-            self._end, self._losses = DeadEndScan(Places(state.views, here), axis), Losses(math.inf)
-        self._ending = True
-        return cells[:0] if self._end.given_up else self._beside(layer, self._end, state, trail)
-
-    def _beside(self, layer: Layer, end: DeadEndScan, state: DroneState, trail: Trail) -> np.ndarray:
-        """Before a wall: corridors that turn off through a narrow mouth, else openings in the side walls."""
-        here = state.p_w[:2]
+        if not len(self._end):
+            self._end = Places(state.views, here)
         cells = self._left(layer, wide(layer, here, SMEARED_BERTH_M))
         places = layer.centres(cells)
-        if len(off := cells[trail.turns_off(places, here) & self._is_this_side(places, here)]):
-            return self._nearest(layer, off, state, end.axis)
-        return self._left(layer, mouths(layer, end.end_w, end.axis, trail.places_w))
+        off = cells[trail.turns_off(places, here) & self._is_this_side(places, here)]
+        return self._nearest(layer, off, state, axis) if len(off) else off
 
     def _left(self, layer: Layer, cells: np.ndarray) -> np.ndarray:
         """Cells ``(N, 2)`` that were not inspected without success."""

@@ -1,0 +1,1 @@
+"""Skills: the behaviours of a flight."""

@@ -1,0 +1,59 @@
+"""Interface of a skill: a small state machine with one timeout and one stated result.
+
+A skill says where to go (goal cells), where to look, and when it has ended; the planner (`navigation/pilot.py`) flies.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from edgeslam_torch.navigation.drone_state import DroneState
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
+
+MOST_LOSSES = 5
+"""Tracking losses at one place that end a skill: a view of a textureless surface fails repeatedly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """How a skill ended."""
+
+    reached: bool
+    reason: str
+
+
+TIME_OVER = Result(True, "the time is over")
+LOST_REPEATEDLY = Result(False, "tracking is lost there repeatedly")
+NO_WAY = Result(False, "no way")
+
+
+@dataclass(slots=True)
+class Skill:
+    """Base of all skills: it goes nowhere, faces the direction of flight, and ends by its timeout."""
+
+    until_s: float = field(default=math.inf, kw_only=True)
+    """Timeout on the clock of the states."""
+
+    def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
+        """Goal cells ``(G, 2)``; by default the current one. Called at every plan."""
+        return layer.cells(state.p_w[:2])[None]
+
+    def result(self, state: DroneState, losses: int = 0) -> Result | None:
+        """The result, None while it runs; ``losses`` at the current place end it. Called for every state."""
+        if state.stamp_s >= self.until_s:
+            return TIME_OVER
+        return LOST_REPEATEDLY if losses >= MOST_LOSSES else None
+
+    def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
+        """Receive undecided openings and exits."""
+
+    def look_rad(self, state: DroneState) -> float | None:
+        """Heading to turn to while hovering; None to fly on."""
+        return None
+
+    def faces_rad(self, state: DroneState) -> float | None:
+        """Heading to keep during slow flight through known space; None to face the direction of flight."""
+        return None
