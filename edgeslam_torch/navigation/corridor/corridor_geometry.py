@@ -1,13 +1,13 @@
 """Geometry of a corridor around the drone: free space ahead and walls."""
 
-import math
 from collections.abc import Callable
 
 import numpy as np
 from scipy import ndimage
 
-from edgeslam_torch.navigation.corridor.trail import aside
+from edgeslam_torch.navigation.corridor.trail import SAME_M, aside
 from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.openings.exit_tracker import SAME_COS
 from edgeslam_torch.types import FloatArray
 
 _BERTH_M = 0.55
@@ -22,9 +22,6 @@ _STRIP_M = 0.6
 """Half width of the strip straight ahead."""
 _NEAREST_M = 1.0
 """Maximum distance from the drone to the space that it follows."""
-_AHEAD_COS = math.cos(math.radians(35.0))
-_SAME_M = 0.3
-"""Distances along the axis that differ by less count as equal."""
 _WALL_M, _ABREAST_M = 2.0, 0.5
 """Distance at which a wall ahead ends a corridor, and half width of the search for it: the wall may have a door."""
 
@@ -38,7 +35,7 @@ def is_ahead(p_w: FloatArray, here_w: FloatArray, axis: FloatArray) -> np.ndarra
     """Which of the points ``(N, 2)`` are ahead and far enough."""
     step = p_w - here_w
     along = step @ axis
-    return np.asarray((along > _ARRIVED_M) & (along > _AHEAD_COS * np.linalg.norm(step, axis=1)))
+    return np.asarray((along > _ARRIVED_M) & (along > SAME_COS * np.linalg.norm(step, axis=1)))
 
 
 def straight(layer: Layer, here_w: FloatArray, axis: FloatArray, before_m: float) -> np.ndarray:
@@ -53,7 +50,7 @@ def far_middle(layer: Layer, cells: np.ndarray, axis: FloatArray) -> np.ndarray:
     if len(cells) == 0:
         return cells
     along = layer.centres(cells) @ axis
-    last = cells[along > along.max() - _SAME_M]
+    last = cells[along > along.max() - SAME_M]
     left = aside(layer.centres(last), axis)
     return last[[int(np.argmin(np.abs(left - np.median(left))))]]
 

@@ -20,7 +20,8 @@ _ALONG_WALLS_COS = math.cos(math.radians(25.0))
 """Maximum angle between the direction of flight and the walls while avoiding obstacles."""
 _DEAD_END_M = 1.5
 """Radius of a dead end."""
-_SAME_M = 0.3
+SAME_M = 0.3
+"""Distance within which places of a corridor are the same."""
 
 
 @dataclass(slots=True)
@@ -71,7 +72,7 @@ class Trail:
 
     def end(self, state: DroneState) -> None:
         """Mark the position as a dead end."""
-        if not self._dead_ends.is_near(state.p_w[:2], _SAME_M):
+        if not self._dead_ends.is_near(state.p_w[:2], SAME_M):
             self._dead_ends.add(state.views, state.p_w[:2])
 
     def leads_on(self, p_w: FloatArray) -> np.ndarray:

@@ -11,8 +11,8 @@ from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.types import FloatArray
 
-_PASSED_M = 0.25
-"""Distance from obstacles at which the drone passes; frontiers closer to one are unreachable."""
+PASSED_M = 0.25
+"""Distance from obstacles at which the drone passes; what is closer to one is unreachable."""
 _FRONTIER_M = 0.3
 """Minimum frontier length; shorter ones are gaps between rays. A doorway of 0.85 m leaves this much."""
 WIDE_M = 1.0
@@ -30,7 +30,7 @@ _ROUND_S = 13.0
 def frontiers(layer: Layer, least_m: float = _FRONTIER_M) -> np.ndarray:
     """One cell ``(F, 2)`` for each frontier of at least ``least_m``."""
     unseen = ~layer.free & ~layer.solid
-    border = layer.free & ndimage.binary_dilation(unseen) & (layer.from_solid_m > _PASSED_M)
+    border = layer.free & ndimage.binary_dilation(unseen) & (layer.from_solid_m > PASSED_M)
     parts, count = ndimage.label(border, np.ones((3, 3)))
     out = []
     for part in range(1, count + 1):
@@ -42,7 +42,7 @@ def frontiers(layer: Layer, least_m: float = _FRONTIER_M) -> np.ndarray:
 
 def reachable(cells: np.ndarray, layer: Layer, here_w: FloatArray) -> np.ndarray:
     """Cells ``(G, 2)`` connected to a point ``(2,)`` through space without obstacles."""
-    parts, _ = ndimage.label(layer.from_solid_m > _PASSED_M - 0.5 * layer.cell_m)
+    parts, _ = ndimage.label(layer.from_solid_m > PASSED_M - 0.5 * layer.cell_m)
     i, j = layer.cells(here_w)
     around = parts[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3]
     return cells[np.isin(parts[cells[:, 0], cells[:, 1]], around[around > 0])]

@@ -14,22 +14,17 @@ import numpy as np
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.coverage import Borders, Coverage, borders
-from edgeslam_torch.navigation.exploring.frontiers import reachable
+from edgeslam_torch.navigation.exploring.frontiers import PASSED_M, reachable
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.exit_tracker import FIELD_RAD, PLACES_M, Candidate
+from edgeslam_torch.navigation.openings.exits import NARROWEST_M
 from edgeslam_torch.types import FloatArray
 
 _EVERY_M = 1.2
-"""Distance between looks around: a door of 0.85 m is seen from two places."""
-_ON_THE_WAY_M = 1.2
-"""Distance of a viewpoint before an opening that is no detour."""
+"""Distance between looks around: a door of 0.85 m is seen from two places; and of a viewpoint that is no detour."""
 _THERE_M = 0.25
 """Distance that counts as arrived; the planner comes no closer."""
-_WORTH_M = 0.6
-"""Minimum length of uncovered border for a look: the narrowest exit."""
-_REST_M = 0.3
-"""Remaining length in one direction that is ignored."""
 _BEFORE_M = (0.8, 2.0)
 """Distances in front of the wall at which an opening fits into the field of view and depth is reliable."""
 _ASIDE = 0.3
@@ -37,8 +32,6 @@ _ASIDE = 0.3
 behind."""
 _INSIDE_M = 0.15
 """Margin of viewpoints inside that region: the planner stops slightly short of a goal."""
-_PASSED_M = 0.3
-"""Distance of viewpoints from obstacles."""
 _COARSE = 3
 """Subsampling of candidate viewpoints in cells."""
 _MOST = 8
@@ -98,11 +91,11 @@ class ViewPlanner:
         """
         here = state.p_w[:2]
         self._left = self._coverage.unlooked(borders(layer, here))
-        free = np.argwhere(layer.free & (layer.from_solid_m > _PASSED_M)) if among is None else among
+        free = np.argwhere(layer.free & (layer.from_solid_m > PASSED_M)) if among is None else among
         cells = reachable(free, layer, here)
         p_w = layer.centres(cells).reshape(-1, 2)
         informative = self._informative(p_w, _INSIDE_M)
-        near = informative & (np.linalg.norm(p_w - here, axis=1) <= _ON_THE_WAY_M)
+        near = informative & (np.linalg.norm(p_w - here, axis=1) <= _EVERY_M)
         self._seek(p_w[informative], state)
         if near.any():
             return np.asarray(cells[near])
@@ -160,8 +153,8 @@ class ViewPlanner:
         chosen: list[int] = []
         while len(cells) and len(chosen) < _MOST:
             gain_m = shown.sum(1) * self._left.cell_m
-            best = int(np.argmax(np.where(gain_m >= _WORTH_M, gain_m - 0.1 * away, -np.inf)))
-            if gain_m[best] < _WORTH_M:
+            best = int(np.argmax(np.where(gain_m >= NARROWEST_M, gain_m - 0.1 * away, -np.inf)))
+            if gain_m[best] < NARROWEST_M:
                 break
             chosen.append(best)
             shown &= ~shown[best]
@@ -170,7 +163,7 @@ class ViewPlanner:
     def _is_new(self, here_w: FloatArray) -> bool:
         """Whether to look from here: far enough from earlier looks, with enough to see."""
         far = float(self._places.away_m(here_w)) > _EVERY_M - _THERE_M
-        return far and bool(self._left.before(here_w[None]).sum() * self._left.cell_m >= _WORTH_M)
+        return far and bool(self._left.before(here_w[None]).sum() * self._left.cell_m >= NARROWEST_M)
 
     def _sides(self, here_w: FloatArray, yaw_rad: float) -> list[float]:
         """Turns from the current heading that cover the borders visible from here, greedily."""
@@ -181,7 +174,7 @@ class ViewPlanner:
         while len(left):
             shown = np.abs(wrapped(left - tried[:, None])) < _SHOWN_RAD
             best = int(np.argmax(shown.sum(1)))
-            if shown[best].sum() * self._left.cell_m < _REST_M:
+            if shown[best].sum() * self._left.cell_m < 0.5 * NARROWEST_M:
                 break
             found.append(float(tried[best]))
             left = left[~shown[best]]

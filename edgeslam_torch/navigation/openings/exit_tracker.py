@@ -10,14 +10,14 @@ from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.depth_rays import DepthRays
 from edgeslam_torch.navigation.openings.detour import has_detour
-from edgeslam_torch.navigation.openings.exits import WIDEST_M, Gap, openings
-from edgeslam_torch.navigation.openings.wall_frame import Walls, along_walls
+from edgeslam_torch.navigation.openings.exits import SAME_M, WIDEST_M, Gap, openings
+from edgeslam_torch.navigation.openings.wall_frame import CELL_SIGMAS, Walls, along_walls
 from edgeslam_torch.navigation.supervisor import DEAD_RECKONING_SIGMA_M
 from edgeslam_torch.types import FloatArray
 
 _EVERY_S = 0.5
-_SAME_M, _SAME_COS = 0.5, math.cos(math.radians(35.0))
-"""Distance and angle within which detections belong to the same opening."""
+SAME_COS = math.cos(math.radians(35.0))
+"""Maximum angle between directions that belong to the same opening or wall."""
 _PASSAGE_M = 1.0
 """Minimum distance between two doors along a passage."""
 PLACES_M = 0.5
@@ -48,8 +48,6 @@ _UNDECIDED, _OPEN = 0.0, 1.5
 enough for this."""
 _PARTS, _PARTS_LIMIT = 0.2, 4.0
 """Log-odds, and their bound, of a view with or without a known way around: it comes and goes as the map is built."""
-_CELL_SIGMAS = 1.0 / math.sqrt(6.0)
-"""Standard deviation of a width between two cells [cells]: both ends are uniform within their cells."""
 _NOISE_M, _DRIFT_M = 0.1, 0.02
 """Standard deviation of a detected position or width, one cell, and of its change by the next detection."""
 
@@ -123,8 +121,8 @@ class _Track:
 
     def is_at(self, gap: Gap) -> bool:
         """Whether a detection belongs to it; the sign of the normal depends on the side of the drone."""
-        near = float(np.linalg.norm(gap.centre_w - self.centre_w)) < _SAME_M
-        return near and abs(float(gap.normal_w @ self.normal_w)) > _SAME_COS
+        near = float(np.linalg.norm(gap.centre_w - self.centre_w)) < SAME_M
+        return near and abs(float(gap.normal_w @ self.normal_w)) > SAME_COS
 
     def measure(self, gap: Gap) -> None:
         """Kalman update of centre, normal and width."""
@@ -244,7 +242,7 @@ def _passes(rays: DepthRays | None, gap: Gap) -> bool:
 def _exit(track: _Track, state: DroneState) -> Exit:
     """The opening as measured."""
     away = float(np.linalg.norm(track.centre_w - state.p_w[:2]))
-    cell_m, sigma_m = _NOISE_M * _CELL_SIGMAS, math.sqrt(track.variance)
+    cell_m, sigma_m = _NOISE_M * CELL_SIGMAS, math.sqrt(track.variance)
     return Exit(
         np.array([*track.centre_w, state.p_w[2]]),
         np.array([*track.normal_w, 0.0]),
@@ -261,9 +259,9 @@ def _one_passage(exit_: Exit, other: Exit) -> bool:
     offset, normal = exit_.centre_w - other.centre_w, other.normal_w
     along = abs(float(offset @ normal))
     beside = math.sqrt(max(0.0, float(offset @ offset) - along**2))
-    parallel = abs(float(exit_.normal_w @ normal)) > _SAME_COS
+    parallel = abs(float(exit_.normal_w @ normal)) > SAME_COS
     behind = parallel and along < _PASSAGE_M and beside < 0.5 * max(exit_.width_m, other.width_m)
-    return behind or float(np.linalg.norm(offset)) < _SAME_M
+    return behind or float(np.linalg.norm(offset)) < SAME_M
 
 
 def _is_looked_at(track: _Track, state: DroneState) -> bool:

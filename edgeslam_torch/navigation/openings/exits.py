@@ -32,7 +32,7 @@ _ROOM_SHARE = 0.5
 """Minimum share of free cells in front of an opening that leads nowhere yet."""
 _PARTLY_FREE = 0.3
 """Minimum share of free cells in any opening."""
-_SAME_M = 0.5
+SAME_M = 0.5
 """Openings closer than this are the same."""
 
 
@@ -139,6 +139,6 @@ def _distinct(found: list[Gap]) -> list[Gap]:
     """Non-maximum suppression: what leads on first, then by the length of collinear wall."""
     kept: list[Gap] = []
     for gap in sorted(found, key=lambda g: (not g.is_free, not g.leads, -g.wall_m)):
-        if all(np.linalg.norm(gap.centre_w - other.centre_w) > _SAME_M for other in kept):
+        if all(np.linalg.norm(gap.centre_w - other.centre_w) > SAME_M for other in kept):
             kept.append(gap)
     return kept

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.navigation.openings.wall_frame import WallGrid, Walls, runs, wall_directions, wall_grid
+from edgeslam_torch.navigation.openings.wall_frame import CELL_SIGMAS, WallGrid, Walls, runs, wall_directions, wall_grid
 from edgeslam_torch.types import FloatArray
 
 NARROWEST_M, WIDEST_M = 0.8, 3.2
@@ -16,7 +16,6 @@ _STEADY_M = 0.8
 """Maximum change of width between neighbouring sections; a door ends the corridor."""
 _BOUND = 0.6
 """Minimum share of sections bounded by obstacles on both sides."""
-_CELL_SIGMAS = 1.0 / math.sqrt(6.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +118,7 @@ def _pathway(grid: WallGrid, chain: list[_Section], here_w: FloatArray) -> Pathw
     ends = np.array([grid.at(c.s, slope * c.s + at) for c in (chain[0], chain[-1])])
     if np.linalg.norm(ends[1] - here_w) < np.linalg.norm(ends[0] - here_w):
         ends = ends[::-1].copy()
-    return Pathway(ends, width, math.hypot(grid.cell_m * _CELL_SIGMAS, float(np.std(widths))))
+    return Pathway(ends, width, math.hypot(grid.cell_m * CELL_SIGMAS, float(np.std(widths))))
 
 
 def _within(way: Pathway, other: Pathway) -> bool:

@@ -9,6 +9,8 @@ import numpy as np
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.types import FloatArray
 
+CELL_SIGMAS = 1.0 / math.sqrt(6.0)
+"""Standard deviation of a width between two cells [cells]: both ends are uniform within their cells."""
 REACH_M = 6.0
 """Half side of the grid; beyond it depth does not resolve a wall."""
 _STEP_RAD = math.radians(3.0)

@@ -20,7 +20,7 @@ from edgeslam_torch.navigation.exploring.frontiers import Looks
 from edgeslam_torch.navigation.exploring.view_planner import ViewPlanner
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
-from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
+from edgeslam_torch.navigation.openings.exit_tracker import SAME_COS, Candidate, Exit
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
 from edgeslam_torch.navigation.skills.skill import Result, Skill
 from edgeslam_torch.types import FloatArray
@@ -36,8 +36,6 @@ _AT_END_M = 0.4
 _ROOM_S = 2.0
 _MOST_LOSSES = 3
 """Tracking losses before a bare wall at a corridor's end after which it is not viewed any more."""
-_SQUARE_COS = math.cos(math.radians(35.0))
-"""A door whose normal is within 35 degrees of the corridor's direction lies across it."""
 
 
 @dataclass(slots=True)
@@ -159,7 +157,7 @@ class FollowCorridor(Skill):
         ways = [
             float((middle - here) @ axis)
             for middle, normal in (*self._doors, *self._doubtful)
-            if abs(float(normal @ axis)) > _SQUARE_COS and abs(float(aside(middle - here, axis))) < PASSED_M
+            if abs(float(normal @ axis)) > SAME_COS and abs(float(aside(middle - here, axis))) < PASSED_M
         ]
         return min([way for way in ways if way > 0.0], default=math.inf)
 
