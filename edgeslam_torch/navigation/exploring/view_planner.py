@@ -51,6 +51,8 @@ _SOUGHT_S = 30.0
 class ViewPlanner:
     """Proposes viewpoints and headings until no view would be informative."""
 
+    stands_s: float = 0.0
+    """Duration of a view at each heading; without it the views in passing count."""
     _coverage: Coverage = field(default_factory=Coverage)
     _left: Borders = field(default_factory=lambda: Borders(np.zeros((0, 2)), np.zeros((0, 2)), 0.0))
     """Borders not covered at the last call."""
@@ -66,13 +68,14 @@ class ViewPlanner:
     """Start of the look around."""
     _stands_s: float = math.nan
     """Start of the look at an opening."""
+    _faces_s: float = math.nan
+    """Since when the drone faces the last of the headings."""
     _sought_s: float = math.nan
     """Since when a viewpoint before an opening is sought."""
 
-    @property
-    def looks(self) -> bool:
-        """Whether a look is under way."""
-        return bool(self._headings)
+    def looks_from(self, here_w: FloatArray) -> bool:
+        """Whether a look from a point ``(2,)`` is under way or informative."""
+        return bool(self._headings) or self._is_new(here_w)
 
     def consider(self, openings: Sequence[Candidate]) -> None:
         """Set the undecided openings."""
@@ -120,7 +123,11 @@ class ViewPlanner:
         if not state.tracked or state.stamp_s - self._since_s > _GIVEN_UP_S:
             self._headings = []
         while self._headings and abs(state.turn_to_rad(self._headings[-1])) < _THERE_RAD:
+            self._faces_s = state.stamp_s if math.isnan(self._faces_s) else self._faces_s
+            if state.stamp_s - self._faces_s < self.stands_s:
+                break
             self._headings.pop()
+            self._faces_s = math.nan
         return self._headings[-1] if self._headings else None
 
     def _informative(self, p_w: FloatArray, inside_m: float = 0.0) -> np.ndarray:

@@ -33,7 +33,11 @@ _BACK_M = 2.3
 """Distance from an apparent end from within which its sides are viewed: a corridor that turns off there was seen at
 a grazing angle in passing."""
 _AT_END_M = 0.4
-_ROOM_S = 2.0
+_STANDS_S = 1.0
+"""Duration of a view at each heading: five depth maps, which show a mouth that was seen at a grazing angle."""
+_HOLDS_S = 2.0
+"""Time for which a room, or an end without a view that is left, must hold: views arrive half a second late, and two
+free a cell."""
 _MOST_LOSSES = 3
 """Tracking losses before a bare wall at a corridor's end after which it is not viewed any more."""
 
@@ -45,12 +49,12 @@ class FollowCorridor(Skill):
     wall: bool = False
     """Whether an obstacle is close ahead; without one, a missing continuation is no end of the corridor."""
     _looks: Looks = field(default_factory=Looks)
-    _views: ViewPlanner = field(default_factory=ViewPlanner)
+    _views: ViewPlanner = field(default_factory=lambda: ViewPlanner(_STANDS_S))
     _trail: Trail | None = None
     _end: Places = field(default_factory=Places)
     """Apparent end of the corridor, if it appears to end now."""
-    _viewed: bool = False
-    """Whether no view of the apparent end is left, and the drone is back there."""
+    _viewed_s: float = math.nan
+    """Since when no view of the apparent end is left, and the drone is back there."""
     _wide_s: float = math.nan
     _target: Places = field(default_factory=Places)
     """Current goal in a corridor that turns off."""
@@ -75,14 +79,17 @@ class FollowCorridor(Skill):
         self.wall = is_walled(layer, here, axis)
         found = self._looks.worth(self._onward(layer, state, axis, self._trail), layer, state)
         if len(found) or not len(self._end):
+            self._viewed_s = math.nan
             return found
         cells = wide(layer, here)
         cells = cells[self._end.away_m(layer.centres(cells).reshape(-1, 2)) < _BACK_M]
         spots = self._views.goals(layer, state, found, cells)
-        if len(spots) or self._views.looks:
-            return spots
-        self._viewed = self._end.is_near(here, _AT_END_M)
-        return spots if self._viewed else layer.cells(self._end.p_w)
+        at_end = self._end.is_near(here, _AT_END_M)
+        if len(spots) or self._views.looks_from(here) or not at_end:
+            self._viewed_s = math.nan
+        elif math.isnan(self._viewed_s):
+            self._viewed_s = state.stamp_s
+        return spots if len(spots) or at_end else layer.cells(self._end.p_w)
 
     def look_rad(self, state: DroneState) -> float | None:
         """Headings of the view planner at an apparent end, else ahead."""
@@ -90,8 +97,9 @@ class FollowCorridor(Skill):
 
     def result(self, state: DroneState, losses: int = 0) -> Result | None:
         """The corridor ended, or the drone has not flown a metre of one."""
-        ends = self._viewed or losses >= _MOST_LOSSES if len(self._end) else self._looks.over(state.stamp_s)
-        room = state.stamp_s - self._wide_s > _ROOM_S
+        viewed = state.stamp_s - self._viewed_s > _HOLDS_S
+        ends = viewed or losses >= _MOST_LOSSES if len(self._end) else self._looks.over(state.stamp_s)
+        room = state.stamp_s - self._wide_s > _HOLDS_S
         result = super(FollowCorridor, self).result(state, losses)
         if not (room or ends or result is not None):
             return None
@@ -109,7 +117,7 @@ class FollowCorridor(Skill):
         cells = self._left(layer, wide(layer, here))
         places = layer.centres(cells)
         if len(ahead := cells[is_ahead(places, here, axis) & trail.leads_on(places)]):
-            self._end, self._viewed = Places(), False
+            self._end = Places()
             return far_middle(layer, ahead, axis)
         trail.end(state)
         if len(off := cells[trail.turns_off(places, here)]):
