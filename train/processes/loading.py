@@ -67,11 +67,12 @@ def _unpacked(batches: Iterator[Any]) -> Iterator[Any]:
                 raise found
             yield found
     except (ConnectionResetError, EOFError) as error:  # a worker dies while it hands over a batch
-        # Once it is dead and joined, torch's handler of that signal raises here, or finds nothing later.
+        # Once it is joined, torch's handler of that signal has raised here, or finds nothing later. Its pipe closes
+        # before it is dead.
         workers = batches._workers  # type: ignore[attr-defined]
-        wait([worker.sentinel for worker in workers])
+        closed = wait([worker.sentinel for worker in workers])
         for worker in workers:
-            if not worker.is_alive():
+            if worker.sentinel in closed:
                 worker.join()
         raise RuntimeError(f"DataLoader worker is gone: {error}") from error
 
