@@ -97,15 +97,15 @@ class LockstepVehicle:
         events = self.tello.advance(TICK_S)
         for event in events:
             if isinstance(event, State):
-                self._hear(StateMessage(event.arrived_s, event.text, parse_state(event.text)))
+                self._on_state(StateMessage(event.arrived_s, event.text, parse_state(event.text)))
             elif isinstance(event, Picture):
                 self._see(event)
         return events
 
-    def _hear(self, message: StateMessage) -> None:
+    def _on_state(self, message: StateMessage) -> None:
         sample = message.sample()
         self.battery = sample.battery
-        self._perception.heard(sample)
+        self._perception.add_telemetry(sample)
         if self._recorder is not None:
             self._recorder.state(message)
 

@@ -71,7 +71,7 @@ class UdpVehicle:
         self._view_lock = threading.Lock()
         self._perception: SlamPerception | None = None
         self._recorder = recorder
-        self.tello = Tello(address, allow_motion, on_state=self._hear)
+        self.tello = Tello(address, allow_motion, on_state=self._on_state)
         try:
             self.tello.connect()
             self._video = self.tello.start_video()
@@ -85,7 +85,7 @@ class UdpVehicle:
                 recorder.begin(self.camera)
             self._perception = SlamPerception(self.camera, seed, realtime=True)
             assert self.tello.latest is not None  # `connect` waited for it
-            self._perception.heard(self.tello.latest.sample())  # the first map needs an attitude to be level
+            self._perception.add_telemetry(self.tello.latest.sample())  # the first map needs an attitude to be level
         except BaseException:
             self.tello.close()
             raise
@@ -142,9 +142,9 @@ class UdpVehicle:
             if self._perception is not None:
                 self._perception.close()
 
-    def _hear(self, message: StateMessage) -> None:
+    def _on_state(self, message: StateMessage) -> None:
         if self._perception is not None:
-            self._perception.heard(message.sample())
+            self._perception.add_telemetry(message.sample())
         if self._recorder is not None:
             self._recorder.state(message)
 

@@ -52,7 +52,7 @@ class PathViews:
     _since_s: float = math.nan
     """Start of the view that is being taken."""
     _stands_s: float = math.nan
-    """Since when the drone stands as it asks."""
+    """Since when the drone has had this position and heading."""
 
     def begin(
         self, unseen_w: FloatArray, ahead_rad: float, view: View | None, state: DroneState, limits: NavLimits

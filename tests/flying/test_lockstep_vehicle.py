@@ -22,7 +22,7 @@ class Truth:
     def __init__(self, *unused):
         self.samples = []
 
-    def heard(self, sample):
+    def add_telemetry(self, sample):
         self.samples.append(sample)
 
     def seen(self, image, arrived_s, captured_s):

@@ -15,7 +15,7 @@ def sample(stamp_s, velocity=(0.0, 0.0, 0.0), yaw=0.0, height_m=1.0):
 def flown(samples):
     fresh = MapReset()
     for one in samples:
-        fresh.heard(one)
+        fresh.add_telemetry(one)
     return fresh
 
 

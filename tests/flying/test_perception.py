@@ -249,7 +249,7 @@ def test_a_map_that_tells_no_metres_in_the_air_is_given_up_for_a_new_one(monkeyp
     perception, revisions = SlamPerception(CAMERA), []
     for k, now_s in enumerate(np.arange(0.0, 1.5 * PATIENCE_S, 1 / 15)):
         if k % 2 == 0:
-            perception.heard(TelemetrySample(now_s, np.zeros(3), np.array([0.0, 0.0, 0.3]), 0.9))
+            perception.add_telemetry(TelemetrySample(now_s, np.zeros(3), np.array([0.0, 0.0, 0.3]), 0.9))
         perception.seen(bare_wall(), now_s, now_s)
         revisions.append(perception._changes)
         assert perception.state(now_s).p_w[2] == pytest.approx(GROUND_M if len(Slam.made) == 1 else 0.9 + GROUND_M)

@@ -36,7 +36,7 @@ class Truth:
     def __init__(self, *unused, **unused_too):
         self.told_by, self.seen_s = set(), []
 
-    def heard(self, sample):
+    def add_telemetry(self, sample):
         self.told_by.add(threading.current_thread())
 
     def seen(self, *unused):

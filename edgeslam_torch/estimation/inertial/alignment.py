@@ -176,9 +176,13 @@ def align(
         if step > metric_steps and (np.abs(by_all) < _CONVERGED * np.sqrt(np.diag(covariance))).all():
             break
     dt_s = pre.dt_s[pre.complete, None]
-    felt = np.diff(x.velocity, axis=0)[pre.complete] / dt_s
+    acceleration = np.diff(x.velocity, axis=0)[pre.complete] / dt_s
     noise_m_s2 = model.accelerometer_noise_density / np.sqrt(dt_s)
-    return replace(x, extent=extent, excitation=float(np.sqrt(np.mean(((felt - felt.mean(axis=0)) / noise_m_s2) ** 2))))
+    return replace(
+        x,
+        extent=extent,
+        excitation=float(np.sqrt(np.mean(((acceleration - acceleration.mean(axis=0)) / noise_m_s2) ** 2))),
+    )
 
 
 def _initial(

@@ -45,8 +45,8 @@ def mount_by_turns(
         sigma_rad: Its standard deviation per axis.
     """
     memory_s = 0.5 * UP_MEMORY_S
-    alike = np.searchsorted(stamps_s, stamps_s + memory_s, "right") - np.searchsorted(stamps_s, stamps_s - memory_s)
-    weight = 1.0 / (LEVEL_RAD**2 * alike)
+    count = np.searchsorted(stamps_s, stamps_s + memory_s, "right") - np.searchsorted(stamps_s, stamps_s - memory_s)
+    weight = 1.0 / (LEVEL_RAD**2 * count)
     R_w_m = mean_rotation(R_w_b @ R_b_c @ np.swapaxes(R_m_c, 1, 2))
     R_b_w = np.swapaxes(R_w_b, 1, 2)
     J = np.concatenate([R_b_w, np.broadcast_to(-np.eye(3), R_b_w.shape)], axis=2)  # by rotations of R_w_m, R_b_c

@@ -136,7 +136,7 @@ class DepthScale:
             f"the depth network is out of its domain here: inside pictures its depth follows the map's with slope "
             f"{self.slope:.2f} (1 is right) and spreads by {100 * self.spread_log:.0f} %, from picture to picture its "
             f"scale wanders by {100 * self.wander_log:.0f} %; its metres may be wrong by a factor of "
-            f"{math.exp(2.0 * self.sigma):.1f} and are not used. Metres need telemetry, a network that knows such "
+            f"{math.exp(2.0 * self.sigma):.1f} and are not used. Metres need telemetry, a network trained on such "
             "scenes (--depth), or 'edgeslam finetune' on recordings like this one"
         )
 

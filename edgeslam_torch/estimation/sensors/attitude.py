@@ -82,8 +82,8 @@ def up_directions(
     t = at_s[frame]
     R_w_c = track.attitude(t) @ R_b_c
     # Errors of neighbours are correlated: together they count as one.
-    alike = (np.abs(t[:, None] - t[None]) < 0.5 * UP_MEMORY_S).sum(1)
-    return UpDirections(frame, R_w_c[:, 2, :], R_w_m[2], UP_RAD * math.sqrt(float(np.median(alike))))
+    correlated = (np.abs(t[:, None] - t[None]) < 0.5 * UP_MEMORY_S).sum(1)
+    return UpDirections(frame, R_w_c[:, 2, :], R_w_m[2], UP_RAD * math.sqrt(float(np.median(correlated))))
 
 
 def is_steady(track: TelemetryTrack, at_s: FloatArray) -> NDArray[np.bool_]:

@@ -157,8 +157,8 @@ class Imu:
         if len(readings) < 2:
             return None
         moments = np.array([from_s, to_s]) + found.offset_s
-        felt = preintegrate(readings, moments, found.bias[-1], self.model, self._range_ends)
-        return found.R_i_c.T @ felt.R[0].T @ found.R_i_c if felt.complete[0] else None
+        measured = preintegrate(readings, moments, found.bias[-1], self.model, self._range_ends)
+        return found.R_i_c.T @ measured.R[0].T @ found.R_i_c if measured.complete[0] else None
 
     def frozen(self, readings: Sequence[ImuReadings] = ()) -> "Imu":
         """A copy for another thread, of the newest readings and of some since then."""
@@ -252,19 +252,21 @@ def imu_mount(
     for k, offset_s in enumerate(grid):
         moments = stamps_s + offset_s
         at = np.stack([np.interp(moments, readings.stamps_s, angle[:, i]) for i in range(3)], axis=1)
-        felt = (np.diff(at, axis=0) / dt[:, None])[near]
-        felt -= np.median(felt, axis=0)
+        rate_i = (np.diff(at, axis=0) / dt[:, None])[near]
+        rate_i -= np.median(rate_i, axis=0)
         R = (
             model.T_imu_cam[:3, :3]
             if model.T_imu_cam is not None
-            else Rotation.align_vectors(felt, turned)[0].as_matrix()
+            else Rotation.align_vectors(rate_i, turned)[0].as_matrix()
         )
-        cost[k] = float(np.sum((felt - turned @ R.T) ** 2))
-        found.append((R, felt))
+        cost[k] = float(np.sum((rate_i - turned @ R.T) ** 2))
+        found.append((R, rate_i))
     best = int(np.argmin(cost))
-    R, felt = found[best]
-    spread = np.linalg.svd(felt, compute_uv=False) / math.sqrt(len(felt))
-    correlation = float(np.sum(felt * (turned @ R.T))) / math.sqrt(float(np.sum(felt**2) * np.sum(turned**2)) + 1e-12)
+    R, rate_i = found[best]
+    spread = np.linalg.svd(rate_i, compute_uv=False) / math.sqrt(len(rate_i))
+    correlation = float(np.sum(rate_i * (turned @ R.T))) / math.sqrt(
+        float(np.sum(rate_i**2) * np.sum(turned**2)) + 1e-12
+    )
     if spread[1] < _LEAST_RATE_RAD_S or correlation < _LEAST_CORRELATION:
         return None
     offset_s = float(grid[best])

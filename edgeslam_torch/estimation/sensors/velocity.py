@@ -201,11 +201,11 @@ def displacements(
         D[np.arange(N), axis, use, axis] = -1.0
     measured = track.readings
     share = _shares(measured.stamp_s, start, end)  # (N, S)
-    heard = np.flatnonzero(share.any(axis=0))
-    share = share[:, heard]
-    R_w = track.axes()[heard]
-    raw = np.einsum("swa,sw->sa", R_w, measured.velocity[heard])
-    U = _runs(share, measured.stamp_s[heard], raw, R_w, step_m_s, truncates)
+    involved = np.flatnonzero(share.any(axis=0))
+    share = share[:, involved]
+    R_w = track.axes()[involved]
+    raw = np.einsum("swa,sw->sa", R_w, measured.velocity[involved])
+    U = _runs(share, measured.stamp_s[involved], raw, R_w, step_m_s, truncates)
     memory = np.exp(-np.abs(start[:, None] - start[None]) / VELOCITY_BIAS_MEMORY_S)
     bias = VELOCITY_BIAS_M_S**2 * memory * np.outer(L, L)
     R_c = track.axes()[np.searchsorted(measured.stamp_s, 0.5 * (start + end))]
@@ -221,7 +221,7 @@ def displacements(
             np.diff(per_scale_w, axis=0)[use][..., None],
             TILT_RAD * hat(d),
             (delay * 10.0 * np.diff(speed, axis=0)[use])[..., None],
-            (half * np.einsum("ns,sa->na", share, measured.sign[heard]))[..., None],
+            (half * np.einsum("ns,sa->na", share, measured.sign[involved]))[..., None],
         ],
         axis=-1,
     )

@@ -33,7 +33,7 @@ class MapReset:
         self._since_s = math.nan
         """Since when it has been in the air without a certain scale."""
 
-    def heard(self, sample: TelemetrySample) -> None:
+    def add_telemetry(self, sample: TelemetrySample) -> None:
         """Process a state message; one without velocity, attitude and height is ignored."""
         if not np.isfinite([*sample.velocity_m_s, *sample.rpy_rad, sample.height_m]).all():
             return

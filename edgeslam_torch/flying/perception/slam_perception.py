@@ -51,7 +51,7 @@ class SlamPerception:
     """Runs `EdgeSlam` on frames and state messages; poses are predicted over the video's latency.
 
     The world is that of `home` at the SLAM's best scale estimate, which may differ from its output unit.
-    `heard` and `state` may be called from any thread, also during `seen`; `seen` from one thread.
+    `add_telemetry` and `state` may be called from any thread, also during `seen`; `seen` from one thread.
 
     Args:
         camera: Camera of the frames.
@@ -102,11 +102,11 @@ class SlamPerception:
         self._sent_unit, self._sent_revision, self._moved_s = 1.0, 0, -np.inf
         self._revision = 0
 
-    def heard(self, sample: TelemetrySample) -> None:
+    def add_telemetry(self, sample: TelemetrySample) -> None:
         """Process a state message."""
         with self._lock:
             self._samples.append(sample)
-            self._map_reset.heard(sample)
+            self._map_reset.add_telemetry(sample)
             if np.isfinite(sample.battery):
                 self._battery = sample.battery
             if np.isfinite(sample.height_m):

@@ -114,7 +114,7 @@ class SlamPerception:
         view = None
         for event in events:
             if isinstance(event, State):
-                self._perception.heard(sample_from_sdk(event.arrived_s, parse_state(event.text)))
+                self._perception.add_telemetry(sample_from_sdk(event.arrived_s, parse_state(event.text)))
             elif isinstance(event, Picture):
                 is_dark = _within(event.captured_s, self._conditions.dark_s)
                 image = np.zeros_like(event.image) if is_dark else event.image
