@@ -90,6 +90,10 @@ class PathViews:
             self.exhausted = Places(state.views, here)
         return best is not None
 
+    def look_ahead(self, state: DroneState) -> None:
+        """Begin the view ahead from above: after take-off the space just ahead is below the picture's lower edge."""
+        self.look, self._since_s, self._stands_s = Look(state.yaw_rad, _RISE_M), state.stamp_s, math.nan
+
     def taking(self, state: DroneState, height_m: float) -> Look | None:
         """The view that is being taken; a tracking loss ends it."""
         if self.look is None:

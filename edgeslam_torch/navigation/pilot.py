@@ -96,6 +96,8 @@ class Pilot:
     """Last time at which the planner's scale was that of the states."""
     _at_take_off: bool = True
     """Whether the space around the take-off is not yet marked as free."""
+    _looks_first: bool = True
+    """Whether the first view from above is still to be taken."""
     _view: View | None = None
     """The last view, for the camera's field of view."""
     _views: PathViews = field(init=False)
@@ -201,7 +203,7 @@ class Pilot:
         """Reset: the relation of the old scale to the new one is unknown."""
         self.space, self.exits = Space(map_views=self.views), ExitTracker()
         self._plan, self._least, self._progress_s = None, math.inf, math.nan
-        self._at_take_off, self._views.look = True, None
+        self._at_take_off, self._looks_first, self._views.look = True, True, None
 
     def _turn(self, error_rad: float) -> float:
         return float(np.clip(2.0 * error_rad, -self.limits.turn_rad_s, self.limits.turn_rad_s))
@@ -228,6 +230,13 @@ class Pilot:
             return VelocityCommand(turn_left_rad_s=self._turn(state.turn_to_rad(heading)), why="hover and look")
         plan = self._planned(state)
         here = state.p_w[:2]
+        stands = float(np.linalg.norm(state.velocity_w[:2])) < _STANDS_M_S
+        if self._looks_first and self.skill.moves and stands and state.tracked:
+            self._looks_first = False
+            heading = np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad)])
+            if len(self._unseen_w(state, here + np.arange(CELL_M, 1.0, CELL_M)[:, None] * heading)):
+                self._views.look_ahead(state)
+                return HOVER
         now = float(plan.at(here))
         if math.isnan(self._least):
             self._least = now
@@ -244,9 +253,10 @@ class Pilot:
         error = state.turn_to_rad(ahead if faced is None else faced)
         turn = self._turn(error)
         chosen = self._chosen(state, plan, ahead, error)
-        stands = float(np.linalg.norm(state.velocity_w[:2])) < _STANDS_M_S
         if (chosen is None or stands) and abs(error) < _FACING_RAD and state.tracked:
-            if self._views.begin(self._unseen_w(state), ahead, self._view, state, self.limits):
+            if self._views.begin(
+                self._unseen_w(state, self.way_w[: round(1.0 / CELL_M)]), ahead, self._view, state, self.limits
+            ):
                 chosen = None
             elif chosen is None:
                 self._tries_narrow &= not self._is_narrow(state)
@@ -257,10 +267,10 @@ class Pilot:
             c * chosen[0] + s * chosen[1], c * chosen[1] - s * chosen[0], 0.0, turn, "along the path"
         )
 
-    def _unseen_w(self, state: DroneState) -> FloatArray:
-        """Unknown cells ``(U, 2)`` that block the first metre of the path."""
+    def _unseen_w(self, state: DroneState, way_w: FloatArray) -> FloatArray:
+        """Unknown cells ``(U, 2)`` that block a path ``(W, 2)``."""
         assert self.layer is not None
-        layer, way_w = self.layer, self.way_w[: round(1.0 / CELL_M)]
+        layer = self.layer
         need = self.limits.clearance_m(state.position_sigma_m) + CELL_M
         low, high = layer.cells(way_w.min(axis=0) - need), layer.cells(way_w.max(axis=0) + need) + 1
         part = np.s_[low[0] : high[0], low[1] : high[1]]

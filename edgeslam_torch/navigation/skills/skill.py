@@ -6,6 +6,7 @@ A skill says where to go (goal cells), where to look, and when it has ended; the
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -34,6 +35,8 @@ NO_WAY = Result(False, "no way")
 class Skill:
     """Base of all skills: it goes nowhere, faces the direction of flight, and ends by its timeout."""
 
+    moves: ClassVar[bool] = True
+    """Whether it flies anywhere."""
     until_s: float = field(default=math.inf, kw_only=True)
     """Timeout on the clock of the states."""
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.skills.skill import NO_WAY, Result, Skill
@@ -18,6 +19,7 @@ class TakeOff(Skill):
         height_m: Flight height.
     """
 
+    moves: ClassVar[bool] = False
     height_m: float
     _began_s: float = math.nan
 
