@@ -233,8 +233,8 @@ class Pilot:
         stands = float(np.linalg.norm(state.velocity_w[:2])) < _STANDS_M_S
         if self._looks_first and self.skill.moves and stands and state.tracked:
             self._looks_first = False
-            heading = np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad)])
-            if len(self._unseen_w(state, here + np.arange(CELL_M, 1.0, CELL_M)[:, None] * heading)):
+            forward = np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad)])
+            if len(self._unseen_w(state, here + np.outer(np.arange(CELL_M, 1.0, CELL_M), forward))):
                 self._views.look_ahead(state)
                 return HOVER
         now = float(plan.at(here))
