@@ -44,8 +44,6 @@ class OrbConfig:
 
     features: int = 1000
     """Keypoints kept per frame; as in ORB-SLAM2 for 640x480."""
-    candidates: int = 1500
-    """Corners detected before they are spread evenly."""
     scale_factor: float = 1.2
     """Ratio of the sizes of two pyramid levels; as in ORB-SLAM2."""
     levels: int = 8
@@ -56,8 +54,8 @@ class OrbConfig:
     """FAST threshold where the image has few corners (cloth, white walls); about twice a camera's noise."""
 
     def __post_init__(self) -> None:
-        _positive(self, "features", "candidates", "levels", "fast_threshold", "fast_faint")
-        _at_most(self, features=100_000, candidates=1_000_000, levels=20)
+        _positive(self, "features", "levels", "fast_threshold", "fast_faint")
+        _at_most(self, features=100_000, levels=20)
         if not 1.0 < self.scale_factor <= 2.0:
             raise ValueError(f"scale_factor must be in (1, 2], got {self.scale_factor}")
 
@@ -73,11 +71,8 @@ class DepthConfig:
     device: str = "cpu"
     """Device: ``auto``, ``cpu``, ``cuda`` or ``mps``. Rounding differs between devices; runs are reproducible on the
     same device only."""
-    prior_sigma_log: float = 0.35
-    """Standard deviation of log depth without a network; wide enough for a desk and the wall behind it."""
 
     def __post_init__(self) -> None:
-        _positive(self, "prior_sigma_log")
         if self.backend not in ("onnxruntime", "torch"):
             raise ValueError(f"backend must be onnxruntime or torch, got {self.backend!r}")
         if self.device not in ("auto", "cpu", "cuda", "mps"):
@@ -88,25 +83,13 @@ class DepthConfig:
 class TrackingConfig:
     """Stage 2: the pose of every frame."""
 
-    motion_radius_px: float = 15.0
-    """Search radius around the predicted pixel, at pyramid level 0: 1.6 degrees at 525 px."""
-    map_radius_px: float = 5.0
-    """Search radius for the local map once the pose is known from the first pass."""
-    max_hamming: int = 64
-    """Maximum Hamming distance [bits of 256]; ORB-SLAM2 uses 50 (strict) and 100 (loose)."""
-    ratio: float = 0.85
-    """Maximum ratio of nearest to second nearest descriptor distance (Lowe)."""
     min_inliers: int = 25
     """Minimum number of inliers of a pose."""
-    local_keyframes: int = 30
-    """Maximum number of keyframes in the local map."""
-    relocalisation_keyframes: int = 4
-    """Keyframes tried in each lost frame."""
     edges: bool = True
     """Use edges for the pose of frames with few keypoints."""
 
     def __post_init__(self) -> None:
-        _positive(self, "motion_radius_px", "map_radius_px", "max_hamming", "ratio", "min_inliers", "local_keyframes")
+        _positive(self, "min_inliers")
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,19 +101,9 @@ class FlowConfig:
     points: int = 350
     """Maximum number of keypoints tracked from the last keyframe; with a pixel of noise at 525 px, 350 fix directions
     to 0.006 degrees."""
-    window_px: int = 15
-    """Side of the tracked patch."""
-    levels: int = 4
-    """Pyramid levels, each half the size of the previous one."""
-    min_share: float = 0.4
-    """Minimum share of tracked keypoints; below, descriptors are matched first. Below this share of those in view, the
-    pose from flow is rejected."""
 
     def __post_init__(self) -> None:
-        _positive(self, "points", "levels", "min_share")
-        _at_most(self, levels=10, window_px=255)
-        if self.window_px < 5:
-            raise ValueError(f"window_px must be at least 5, got {self.window_px}")
+        _positive(self, "points")
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,10 +112,6 @@ class InitialisationConfig:
 
     min_parallax_deg: float = 1.5
     """Median parallax of the inliers before two views are tried."""
-    min_points: int = 80
-    """Minimum number of well triangulated anchors."""
-    max_reprojection_px: float = 2.0
-    """Maximum reprojection error of a triangulated anchor in either view."""
     keyframe_gap_s: float = 0.15
     """Minimum time between the intermediate frames that become keyframes after initialisation."""
     max_keyframes: int = 12
@@ -150,12 +119,9 @@ class InitialisationConfig:
     max_direction_sigma: float = 0.08
     """Standard deviation of the second camera's position relative to the baseline above which initialisation waits:
     0.08 are 4.6 degrees of direction."""
-    max_direction_sigma_alone: float = 0.05
-    """The same, 2.9 degrees, without a depth network: a small rotation and a small translation move an image in nearly
-    the same way, and only parallax, or predicted depth, resolves the two-fold ambiguity."""
 
     def __post_init__(self) -> None:
-        _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px", "keyframe_gap_s", "max_keyframes")
+        _positive(self, "min_parallax_deg", "keyframe_gap_s", "max_keyframes", "max_direction_sigma")
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,27 +133,14 @@ class MappingConfig:
     parallax."""
     keyframe_max_gap_s: float = 0.98
     """Maximum time between keyframes while the camera moves: a second, less half a frame at 30 Hz for rounding."""
-    keyframe_followed: float = 0.9
-    """Insert a keyframe when flow tracks fewer than this share of the last one's keypoints: a rotation by 6 degrees
-    loses a tenth of a 60-degree view."""
-    keyframe_at_once: float = 0.75
-    """Below this share, ``keyframe_min_gap_s`` is ignored: after a rotation by 15 degrees since the last keyframe, at
-    100 degrees a second, half the view would be lost meanwhile."""
-    keyframe_overlap: float = 0.7
-    """Insert a keyframe when fewer than this share of the reference keyframe's anchors is matched."""
     keyframe_parallax_deg: float = 3.0
     """Insert a keyframe when the median parallax to the reference exceeds this: a pixel at 525 px focal length is
     then 4 % of the depth."""
     max_keyframes: int = 200
     """Number of keyframes in the map from which on the most redundant are removed. The only views of places are kept,
     up to twice this number. Limits memory and time."""
-    redundancy: float = 0.95
-    """A keyframe is redundant when this share of its anchors is observed by three others; of 300 anchors, 15 remain,
-    the threshold of covisibility."""
     neighbours: int = 6
     """Neighbouring keyframes used to triangulate new anchors."""
-    min_parallax_deg: float = 1.0
-    """Minimum parallax of a triangulated anchor."""
     window: int = 10
     """Keyframes refined together (the paper says "short")."""
     window_fixed: int = 15
@@ -200,21 +153,11 @@ class MappingConfig:
     pixels is corrected (the paper has no loop closure)."""
 
     def __post_init__(self) -> None:
-        _positive(
-            self,
-            "keyframe_min_gap_s",
-            "keyframe_max_gap_s",
-            "keyframe_parallax_deg",
-            "neighbours",
-            "min_parallax_deg",
-        )
+        _positive(self, "keyframe_min_gap_s", "keyframe_max_gap_s", "keyframe_parallax_deg", "neighbours")
         if self.window < 2:
             raise ValueError(f"window must be at least 2, got {self.window}")
         if self.max_keyframes < self.window + self.window_fixed:
             raise ValueError(f"max_keyframes must be at least window + window_fixed, got {self.max_keyframes}")
-        for name in ("keyframe_overlap", "keyframe_followed", "keyframe_at_once"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise ValueError(f"{name} must be in (0, 1), got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,10 +170,6 @@ class EdgeConfig:
     """The same for a pixel that starts an edge."""
     max_pixels: int = 5000
     """Edge pixels kept per keyframe, evenly thinned."""
-    delay_keyframes: int = 3
-    """Number of later keyframes before a keyframe's edges are measured, so that refined views from both sides exist."""
-    targets: int = 5
-    """Keyframes searched for each edge."""
     max_sigma: float = 0.025
     """Maximum relative depth sigma of an edge point in the map: half a pixel at 525 px over a baseline of 4 % of the
     depth."""
@@ -242,9 +181,7 @@ class EdgeConfig:
     """Maximum number of points; points of a single keyframe are removed first, then half of the oldest."""
 
     def __post_init__(self) -> None:
-        _positive(self, "canny_low", "canny_high", "max_pixels", "targets", "max_sigma", "voxel", "max_points")
-        if self.delay_keyframes < 0:
-            raise ValueError(f"delay_keyframes must be at least 0, got {self.delay_keyframes}")
+        _positive(self, "canny_low", "canny_high", "max_pixels", "max_sigma", "voxel", "max_points")
         if self.canny_high < self.canny_low:
             raise ValueError(f"canny_high must not be below canny_low, got {self.canny_high} < {self.canny_low}")
 

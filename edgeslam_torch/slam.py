@@ -119,7 +119,7 @@ class EdgeSlam:
         self.depth = None if depth is None else CheckedDepth(depth)
         self.map = SlamMap(config.orb.scale_factor, config.orb.levels)
         self.log = TrajectoryLog(self.map)
-        self.edges = EdgeMap(self.map, camera, config.edges, config.depth.prior_sigma_log)
+        self.edges = EdgeMap(self.map, camera, config.edges)
         self._orb = OrbExtractor(config.orb, camera)
         self._repeats = RepeatedImages()
         self._calibration_warning: str | None = None

@@ -577,7 +577,7 @@ def test_known_ground_gets_no_keyframes():
 
 def test_few_keypoints_after_a_dark_start_still_begin_a_map():
     """150 keypoints are enough for a first frame; they must be enough after black ones too."""
-    poor = replace(NO_NETWORK, orb=replace(NO_NETWORK.orb, features=150, candidates=300))
+    poor = replace(NO_NETWORK, orb=replace(NO_NETWORK.orb, features=150))
     slam = EdgeSlam(CAMERA, poor)
     outputs = [slam.step(Frame(i, 0.1 * i, BLACK)) for i in range(3)]
     outputs += [slam.step(replace(f, index=3 + i, stamp_s=1.0 + f.stamp_s)) for i, f in enumerate(panels().frames[:6])]

@@ -12,6 +12,11 @@ from numpy.typing import NDArray
 from edgeslam_torch.compiled import compiled
 from edgeslam_torch.types import IntArray
 
+MAX_HAMMING = 64
+"""Maximum distance of two descriptors [bits of 256]; ORB-SLAM2 uses 50 (strict) and 100 (loose)."""
+RATIO = 0.85
+"""Maximum ratio of the distances of the nearest and the second nearest descriptor (Lowe)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Matches:
@@ -44,7 +49,9 @@ def hamming(a: NDArray[np.uint64], b: NDArray[np.uint64]) -> IntArray:
     return np.bitwise_count(a ^ b).sum(axis=-1, dtype=np.int64)
 
 
-def best_pairs(query: IntArray, train: IntArray, distance: IntArray, max_hamming: int, ratio: float) -> Matches:
+def best_pairs(
+    query: IntArray, train: IntArray, distance: IntArray, max_hamming: int = MAX_HAMMING, ratio: float = RATIO
+) -> Matches:
     """One-to-one matches from candidate pairs.
 
     A query keeps its nearest candidate if it is within ``max_hamming`` and below ``ratio`` times the second nearest;
@@ -77,7 +84,9 @@ def _best_pairs(
     return mine[train], train, best[train]
 
 
-def match_all(a: NDArray[np.uint64], b: NDArray[np.uint64], max_hamming: int, ratio: float) -> Matches:
+def match_all(
+    a: NDArray[np.uint64], b: NDArray[np.uint64], max_hamming: int = MAX_HAMMING, ratio: float = RATIO
+) -> Matches:
     """Mutual nearest neighbours between two whole sets of descriptor words (brute force)."""
     if len(a) == 0 or len(b) < 2:
         return EMPTY

@@ -9,6 +9,8 @@ from edgeslam_torch.config import OrbConfig
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
+CANDIDATES = 1500
+"""Minimum number of corners that are detected before they are spread evenly."""
 FAINT_SHARE = 0.5
 """Share of the requested keypoints below which the image is searched again for fainter corners."""
 
@@ -24,7 +26,7 @@ class OrbExtractor:
 
     def _detector(self, fast_threshold: int) -> cv2.ORB:
         return cv2.ORB.create(
-            nfeatures=self.config.candidates,
+            nfeatures=max(CANDIDATES, self.config.features),
             scaleFactor=self.config.scale_factor,
             nlevels=self.config.levels,
             fastThreshold=fast_threshold,

@@ -16,6 +16,9 @@ REACH_PX = 40.0
 NEAREST = 4
 """Number of nearest anchors used per pixel."""
 
+UNKNOWN_DEPTH_LOG = 0.35
+"""Standard deviation of log depth without a network; wide enough for a desk and the wall behind it."""
+
 MIN_ANCHORS = 8
 """Minimum number of anchors for a fit."""
 
@@ -54,9 +57,7 @@ def fit_to_anchors(network_m: FloatArray, anchor_depth: FloatArray) -> DepthFit 
     return DepthFit(centre, max(spread, 0.02), int(usable.sum()))
 
 
-def depth_prior(
-    keyframe: Keyframe, uv: FloatArray, anchors: Anchors, unknown_sigma_log: float
-) -> tuple[FloatArray, FloatArray]:
+def depth_prior(keyframe: Keyframe, uv: FloatArray, anchors: Anchors) -> tuple[FloatArray, FloatArray]:
     """Expected z-depth [map units] and its log sigma at pixels ``(N, 2)`` of a keyframe, ``(N,)`` each.
 
     With a depth map: the network's depth in map units by the keyframe's anchors, corrected by those nearby, with at
@@ -67,7 +68,6 @@ def depth_prior(
         keyframe: Keyframe with some anchors.
         uv: Undistorted pixels.
         anchors: All anchors.
-        unknown_sigma_log: Sigma without a network.
     """
     observed = keyframe.keypoints_with_anchor()
     p_w = anchors.p_w[keyframe.anchor[observed]]
@@ -93,7 +93,7 @@ def depth_prior(
             log_ratio = fit.log_ratio_at(network)
             return network * np.exp(log_ratio + bend), np.hypot(np.maximum(sigma, unexplained), 0.05)
     log_z, _ = _nearby(cKDTree(anchor_uv), np.log(z), uv)
-    return np.exp(log_z), np.full(len(uv), unknown_sigma_log)
+    return np.exp(log_z), np.full(len(uv), UNKNOWN_DEPTH_LOG)
 
 
 def _bend(anchor_uv: FloatArray, error: FloatArray, uv: FloatArray) -> tuple[FloatArray, float]:

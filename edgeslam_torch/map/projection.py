@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.compiled import compiled
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
-from edgeslam_torch.frontend.matching import Matches, best_pairs, hamming
+from edgeslam_torch.frontend.matching import MAX_HAMMING, RATIO, Matches, best_pairs, hamming
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.anchors import Anchors
 from edgeslam_torch.types import FloatArray, IntArray
@@ -94,8 +94,8 @@ def match_projection(
     keypoint_octave: IntArray,
     grid: KeypointGrid,
     radius_px: FloatArray,
-    max_hamming: int,
-    ratio: float,
+    max_hamming: int = MAX_HAMMING,
+    ratio: float = RATIO,
 ) -> Matches:
     """Match projected anchors (query) to keypoints (train) inside a radius ``(M,)`` each."""
     query, train = grid.near(projection.uv, radius_px)

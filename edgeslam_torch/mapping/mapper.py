@@ -32,6 +32,11 @@ from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.types import FloatArray, IntArray
 
+MIN_PARALLAX_DEG = 1.0
+"""Minimum parallax of a triangulated anchor."""
+REDUNDANCY = 0.95
+"""A keyframe is redundant when this share of its anchors is observed by three others; of 300 anchors, 15 remain, the
+threshold of covisibility."""
 WIDE = 60
 """Keyframes of a wide window: some 20 s of flight. With 25, the two fixed poses dominate the scale and its correction
 overshoots."""
@@ -65,9 +70,7 @@ class Mapper:
         self.map = slam_map
         self.camera = camera
         self.orb = config.orb
-        self.tracking = config.tracking
         self.config = config.mapping
-        self.depth = config.depth
         self.lm = lm
         flying = config.window.flying
         self._edges = None if edges is None or flying is None else WindowEdges(edges, camera, flying, flying=True)
@@ -108,7 +111,7 @@ class Mapper:
         with self.map.lock:
             # Refinement moves the other keyframes too little to change viewing directions.
             self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])
-            drop_needless_priors(self.map, keyframe, np.deg2rad(self.config.min_parallax_deg))
+            drop_needless_priors(self.map, keyframe, np.deg2rad(MIN_PARALLAX_DEG))
             self.cull_keyframes(keyframe)
         return result
 
@@ -143,9 +146,7 @@ class Mapper:
         """Triangulate keypoints without an anchor in either keyframe."""
         prior, sigma = np.full((2, len(keyframe.anchor)), np.nan)
         free = np.flatnonzero(keyframe.anchor < 0)
-        prior[free], sigma[free] = depth_prior(
-            keyframe, keyframe.features.uv[free], self.map.anchors, self.depth.prior_sigma_log
-        )
+        prior[free], sigma[free] = depth_prior(keyframe, keyframe.features.uv[free], self.map.anchors)
         if not np.isfinite(prior).any():
             return
         min_baseline = 0.01 * float(np.nanmedian(prior))
@@ -159,8 +160,6 @@ class Mapper:
                 prior,
                 sigma,
                 self.orb.scale_factor,
-                self.tracking.max_hamming,
-                self.tracking.ratio,
             )
             far.append((other, matches))
             if np.linalg.norm(other.centre_w - keyframe.centre_w) < min_baseline:
@@ -171,7 +170,7 @@ class Mapper:
                 matches,
                 self.camera,
                 self.orb.scale_factor,
-                np.deg2rad(self.config.min_parallax_deg),
+                np.deg2rad(MIN_PARALLAX_DEG),
             )
             if len(p_w) == 0:
                 continue
@@ -252,7 +251,7 @@ class Mapper:
             if other.id == 0 or newest.id - other.id < 3:
                 continue
             observed = other.anchor[other.anchor >= 0]
-            if len(observed) == 0 or np.mean(self.map.anchors.observations[observed] >= 4) > self.config.redundancy:
+            if len(observed) == 0 or np.mean(self.map.anchors.observations[observed] >= 4) > REDUNDANCY:
                 self.map.remove_keyframe(other)
         while len(self.map.keyframes) > self.config.max_keyframes:
             needless = self._most_needless(newest)

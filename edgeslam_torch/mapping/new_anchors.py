@@ -19,8 +19,6 @@ def epipolar_matches(
     prior_depth: FloatArray,
     prior_sigma_log: FloatArray,
     scale_factor: float,
-    max_hamming: int,
-    ratio: float,
 ) -> Matches:
     """Match keypoints without anchors along epipolar segments given by the depth prior.
 
@@ -60,7 +58,7 @@ def epipolar_matches(
     sigma = scale_factor ** other.features.octave[train].astype(np.float64)
     ok = (across**2 <= CHI2_1DOF_95 * sigma**2) | (length[query] < 1.0)
     query, train = query[ok], train[ok]
-    matches = best_pairs(query, train, hamming(keyframe.words[free[query]], other.words[train]), max_hamming, ratio)
+    matches = best_pairs(query, train, hamming(keyframe.words[free[query]], other.words[train]))
     return Matches(free[matches.query], matches.train, matches.distance)
 
 

@@ -13,7 +13,7 @@ from edgeslam_torch.atlas.place_recognition import revisit_candidates
 from edgeslam_torch.frontend.aperture import are_corners
 from edgeslam_torch.frontend.image import as_grey, colours_at
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.map.depth_prior import sample
+from edgeslam_torch.map.depth_prior import UNKNOWN_DEPTH_LOG, sample
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.states.machine import Event
@@ -231,7 +231,7 @@ class Starting:
 
     def _guess_depth(self, keyframe: Keyframe) -> FloatArray:
         """Predicted depth [map units] of every keypoint and its log sigma, ``(N, 2)``."""
-        guess = np.full((len(keyframe.features.uv), 2), self.system.config.depth.prior_sigma_log)
+        guess = np.full((len(keyframe.features.uv), 2), UNKNOWN_DEPTH_LOG)
         network_m, sigma_log = np.full((2, len(guess)), np.nan)
         if keyframe.depth is not None:
             network_m, sigma_log = sample(keyframe.depth, keyframe.features.uv)

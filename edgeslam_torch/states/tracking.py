@@ -15,6 +15,7 @@ from edgeslam_torch.states.step import Located, Step
 from edgeslam_torch.states.system import System
 from edgeslam_torch.tracking.edge_tracker import MIN_EDGES, EdgeTracker, PointsInFrame
 from edgeslam_torch.tracking.flow import (
+    MIN_SHARE,
     FlowTracker,
     Followed,
     Template,
@@ -29,6 +30,8 @@ from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, candidates
 from edgeslam_torch.tracking.tracker import Track, View, make_view, parallax_to
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus, IntArray
 
+TRIES = 4
+"""Keyframes with which a lost frame is compared; half of them near the prediction, half by similar words."""
 FEW_INLIERS = 100
 """Number of keypoints below which edges contribute to a frame's pose: as many as start a map."""
 
@@ -85,7 +88,7 @@ class Tracking:
             located = self._locate_followed(followed, frame.stamp_s)
         # While the worker is busy no keyframe can be created; matching then finds newly mapped anchors.
         # Points that left the view cannot be followed: match the frame's own keypoints first.
-        strong = followed is not None and followed.share >= system.config.flow.min_share
+        strong = followed is not None and followed.share >= MIN_SHARE
         if located is None or located.due or not strong:
             matched = self._match(frame, seen, T_predicted, followed, strong)
             if matched is None and located is not None and followed is not None:
@@ -202,7 +205,7 @@ class Tracking:
         system = self.system
         reference = system.tracker.local_keyframes(track.anchor)[0]
         parallax_rad = parallax_to(reference, track, system.map.anchors.p_w)
-        few = few_matches(track, reference, system.map, system.config.mapping)
+        few = few_matches(track, reference, system.map)
         since_s = stamp_s - system.keyframe_s
         due = due or is_due(few, parallax_rad, since_s, system.config.mapping)
         self._template = template_of_track(track, view, reference, seen.grey)
@@ -229,10 +232,9 @@ class Tracking:
     def _relocalise(self, frame: Frame, view: View, T_predicted: FloatArray, lost_frames: int) -> Track | None:
         """Relocalise among keyframes near the prediction and revisit candidates."""
         system = self.system
-        tries = system.config.tracking.relocalisation_keyframes
-        near = candidates(system.tracker, T_predicted, tries - tries // 2, lost_frames)
+        near = candidates(system.tracker, T_predicted, TRIES - TRIES // 2, lost_frames)
         others = [k for k in system.map.keyframes.values() if not any(k is n for n in near)]
-        revisits = revisit_candidates(system.map, view.words, others, tries // 2)
+        revisits = revisit_candidates(system.map, view.words, others, TRIES // 2)
         return self.find(frame, view, [*near, *revisits], system.reach(frame.stamp_s, T_predicted))
 
     def find(self, frame: Frame, view: View, keyframes: list[Keyframe], reach: Reach) -> Track | None:

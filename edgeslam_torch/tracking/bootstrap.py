@@ -14,6 +14,7 @@ from edgeslam_torch.mapping.prior_anchors import prior_of
 from edgeslam_torch.mapping.refinement import Window, refine
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.initialiser import (
+    MIN_POINTS,
     BootstrapView,
     Consensus,
     TwoView,
@@ -22,11 +23,14 @@ from edgeslam_torch.tracking.initialiser import (
     two_view_map,
 )
 from edgeslam_torch.tracking.pose_prior import TrackingPrior
-from edgeslam_torch.tracking.tracker import Track, Tracker, View
+from edgeslam_torch.tracking.tracker import MOTION_RADIUS_PX, Track, Tracker, View
 from edgeslam_torch.types import FloatArray, Frame, IntArray
 
 logger = logging.getLogger(__name__)
 
+MAX_DIRECTION_SIGMA_ALONE = 0.05
+"""As `InitialisationConfig.max_direction_sigma`, 2.9 degrees, without a depth network: a small rotation and a small
+translation move an image in nearly the same way, and only parallax, or predicted depth, resolves the ambiguity."""
 WITNESS_SHARE = 0.6
 """Minimum share of inliers in the intermediate frames: correct structures reach 0.8 to 0.95 (95 % of correct
 matches)."""
@@ -127,7 +131,7 @@ class Bootstrap:
 
     def track(self, view: View, T_predicted: FloatArray, expected: TrackingPrior | None = None) -> Track | None:
         """Pose against the predicted map; the pose is rough, the matches are reliable."""
-        radius = 2.0 * self.tracker.config.motion_radius_px
+        radius = 2.0 * MOTION_RADIUS_PX
         track = self.tracker.refine(view, T_predicted, self._guessed, radius, expected=expected)
         if track is not None and self._moved_px(view, track) > SAME_PICTURE_PX:
             self.max_matched = max(self.max_matched, track.inliers)
@@ -197,10 +201,10 @@ class Bootstrap:
         if self.reference.depth is not None:
             joint = self._likelier(joint, self._from_guess(view, two_view))
         logger.debug("initialisation: %s", joint)
-        if joint.agreeing < AGREEING_SHARE or len(joint.two_view.p_w) < self.config.min_points:
+        if joint.agreeing < AGREEING_SHARE or len(joint.two_view.p_w) < MIN_POINTS:
             return replace(two_view, ok=False, reason="the frames together disagree with two views")
         alone = self.reference.depth is None
-        most = self.config.max_direction_sigma_alone if alone else self.config.max_direction_sigma
+        most = MAX_DIRECTION_SIGMA_ALONE if alone else self.config.max_direction_sigma
         if joint.direction_sigma > most:
             return replace(two_view, ok=False, reason="rotation and translation are not yet distinguishable")
         return joint.two_view

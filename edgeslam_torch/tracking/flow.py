@@ -31,6 +31,16 @@ MIN_DEPTH = 1e-3
 JOIN_PX = 1.5
 """Maximum distance between a keypoint and a tracked anchor that are the same, at pyramid level 0."""
 
+MIN_SHARE = 0.4
+"""Minimum share of tracked keypoints; below, descriptors are matched first. Below this share of those in view, the
+pose from flow is rejected."""
+
+WINDOW_PX = 15
+"""Side of the tracked patch."""
+
+LEVELS = 4
+"""Pyramid levels, each half the size of the previous one."""
+
 NEAR_LEVELS = 2
 """Pyramid levels that suffice for predictions within 14 pixels, at half the time of four."""
 
@@ -181,11 +191,10 @@ class FlowTracker:
         visible, guess = wanted[in_view], guess[in_view]
         if len(visible) < self.min_inliers:
             return None
-        near = min(NEAR_LEVELS, self.config.levels)
-        least = max(self.min_inliers, self.config.min_share * len(visible))
-        track, uv = self._locate(template, grey, visible, guess, T_c_w, near, expected)
-        if track.inliers < NEAR_SHARE * len(wanted) and near < self.config.levels:
-            far = self._locate(template, grey, visible, guess, T_c_w, self.config.levels, expected)
+        least = max(self.min_inliers, MIN_SHARE * len(visible))
+        track, uv = self._locate(template, grey, visible, guess, T_c_w, NEAR_LEVELS, expected)
+        if track.inliers < NEAR_SHARE * len(wanted):
+            far = self._locate(template, grey, visible, guess, T_c_w, LEVELS, expected)
             # Patches of coarse levels extend beyond the image: keypoints near its border are found on fine levels.
             track, uv = far if far[0].inliers >= least else max(far, (track, uv), key=lambda tried: tried[0].inliers)
         if track.inliers < self.min_inliers:
@@ -240,13 +249,12 @@ class FlowTracker:
         self, template: Template, grey: NDArray[np.uint8], keypoint: IntArray, guess: FloatArray, levels: int
     ) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Distorted pixels ``(M, 2)`` of the template's keypoints in the frame, and which of them were found."""
-        window = (self.config.window_px, self.config.window_px)
         uv, status, difference = cv2.calcOpticalFlowPyrLK(
             template.grey,
             grey,
             np.ascontiguousarray(self.camera.distort_points(template.uv[keypoint]), np.float32).reshape(-1, 1, 2),
             np.ascontiguousarray(guess, dtype=np.float32).reshape(-1, 1, 2),
-            winSize=window,
+            winSize=(WINDOW_PX, WINDOW_PX),
             maxLevel=levels - 1,
             criteria=_STOP,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,

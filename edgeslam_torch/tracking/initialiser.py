@@ -22,6 +22,11 @@ from edgeslam_torch.tracking.relative_pose import relative_pose
 from edgeslam_torch.tracking.tracker import View
 from edgeslam_torch.types import FloatArray, IntArray, MotionKind
 
+MIN_POINTS = 80
+"""Minimum number of well triangulated anchors of a map."""
+MAX_REPROJECTION_PX = 2.0
+"""Maximum reprojection error of a triangulated anchor in either view."""
+
 
 @dataclass(frozen=True, slots=True)
 class BootstrapView:
@@ -81,12 +86,12 @@ def two_view_map(
     p_c = se3.transform(motion.T_j_i, p_r)
     with np.errstate(invalid="ignore", divide="ignore"):
         good = motion.inliers & np.isfinite(p_r).all(1) & (p_r[:, 2] > 0) & (p_c[:, 2] > 0)
-        good &= np.linalg.norm(camera.project(p_r) - uv_r, axis=1) < config.max_reprojection_px
-        good &= np.linalg.norm(camera.project(p_c) - uv_c, axis=1) < config.max_reprojection_px
+        good &= np.linalg.norm(camera.project(p_r) - uv_r, axis=1) < MAX_REPROJECTION_PX
+        good &= np.linalg.norm(camera.project(p_c) - uv_c, axis=1) < MAX_REPROJECTION_PX
         a, b = p_r, p_r + motion.T_j_i[:3, :3].T @ motion.T_j_i[:3, 3]
         cosine = (a * b).sum(1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
         good &= cosine < np.cos(np.deg2rad(0.5 * config.min_parallax_deg))
-    if good.sum() < config.min_points:
+    if good.sum() < MIN_POINTS:
         return TwoView(False, f"only {int(good.sum())} points triangulate", motion.parallax_rad)
     if good.sum() < 0.6 * motion.inliers.sum():
         return TwoView(False, "most points triangulate badly", motion.parallax_rad)

@@ -15,6 +15,14 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 SHORTEST_GAP_S = 0.04
 """Minimum time between keyframes whatever the change of view: every second frame at 30 Hz, every frame at 20."""
+FOLLOWED = 0.9
+"""Share of the last keyframe's keypoints below which flow asks for a keyframe: a rotation by 6 degrees loses a tenth of
+a 60-degree view."""
+AT_ONCE = 0.75
+"""Below this share, the minimum time between keyframes is ignored: after a rotation by 15 degrees since the last
+keyframe, at 100 degrees a second, half the view would be lost meanwhile."""
+OVERLAP = 0.7
+"""Share of the reference keyframe's anchors below which matching asks for a keyframe."""
 
 OLD_S = 10.0
 """Age from which on a keyframe belongs to an earlier visit; more recent ones, of a shaking hand or a rotation in place,
@@ -34,28 +42,28 @@ CHANCE = 0.05
 """Significance level at which missing anchors indicate a change of the place."""
 
 
-def lost_sight(followed: Followed, config: MappingConfig) -> bool:
+def lost_sight(followed: Followed) -> bool:
     """Whether flow tracks too few keypoints of the last keyframe."""
-    return followed.share < config.keyframe_followed
+    return followed.share < FOLLOWED
 
 
-def lost_most(followed: Followed, config: MappingConfig) -> bool:
+def lost_most(followed: Followed) -> bool:
     """Whether flow tracks so few keypoints of the last keyframe that the next one is due at once: a fast rotation."""
-    return followed.share < config.keyframe_at_once
+    return followed.share < AT_ONCE
 
 
 def due_by_flow(followed: Followed, parallax_rad: float, since_keyframe_s: float, config: MappingConfig) -> bool:
     """Whether a frame tracked by flow should become a keyframe; arguments as in `is_due`."""
-    changed, at_once = lost_sight(followed, config), lost_most(followed, config)
+    changed, at_once = lost_sight(followed), lost_most(followed)
     return is_due(changed, parallax_rad, since_keyframe_s, config, at_once)
 
 
-def few_matches(track: Track, reference: Keyframe, slam_map: SlamMap, config: MappingConfig) -> bool:
+def few_matches(track: Track, reference: Keyframe, slam_map: SlamMap) -> bool:
     """Whether too few of the reference keyframe's anchors are matched."""
     # Anchors of only two keyframes are unstable; overlap is measured on the others.
     observed = reference.anchor[reference.anchor >= 0]
     established = int((slam_map.anchors.observations[observed] >= min(3, len(slam_map.keyframes))).sum())
-    return track.inliers < config.keyframe_overlap * established
+    return track.inliers < OVERLAP * established
 
 
 def is_due(

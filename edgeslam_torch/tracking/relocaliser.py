@@ -218,8 +218,8 @@ def match_keyframe(tracker: Tracker, view: View, keyframe: Keyframe) -> Track | 
     observed = keyframe.keypoints_with_anchor()
     if len(observed) < MIN_MATCHES:
         return None
-    config, camera, anchors = tracker.config, tracker.camera, tracker.map.anchors
-    matches = match_all(keyframe.words[observed], view.words, config.max_hamming, config.ratio)
+    camera, anchors = tracker.camera, tracker.map.anchors
+    matches = match_all(keyframe.words[observed], view.words)
     if len(matches) < MIN_MATCHES:
         return None
     ids = keyframe.anchor[observed[matches.query]]

@@ -309,7 +309,7 @@ def _spread(frames: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 def _matched_pairs(frames: list[np.ndarray], width: int, height: int) -> list[tuple[FloatArray, FloatArray]]:
     camera = Camera(width, height, width, width, (width - 1) / 2.0, (height - 1) / 2.0)
-    orb = OrbExtractor(OrbConfig(features=700, candidates=1500), camera)
+    orb = OrbExtractor(OrbConfig(features=700), camera)
     features = [orb(f if f.ndim == 2 else cv2.cvtColor(f, cv2.COLOR_BGR2GRAY)) for f in frames]
     bits = [words(f.descriptors) for f in features]
     pairs = []

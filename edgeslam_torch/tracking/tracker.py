@@ -26,9 +26,15 @@ ENOUGH_FOR_ROUGH = 250
 FINE = PoseConfig(rounds=3, robust_rounds=1, cost_tolerance=1e-2)
 """The pass on all matches; its tolerance is 0.1 standard deviations: less than the frame's own noise."""
 
+MOTION_RADIUS_PX = 15.0
+"""Search radius around the predicted pixel, at pyramid level 0: 1.6 degrees at 525 px."""
 WIDER = 2.5
 """Factor on the radius of a second search: 37 instead of 15 px, 4 degrees at 525 px, a rotation of 120 degrees a second
 at 30 Hz."""
+MAP_RADIUS_PX = 5.0
+"""Search radius for the local map once the pose is known from the first pass."""
+LOCAL_KEYFRAMES = 30
+"""Maximum number of keyframes in the local map."""
 MIN_ROUGH = 10
 """Inliers of a rough pose from which the local map is searched: 20 equations for 6 unknowns. `min_inliers` decides
 after that search."""
@@ -96,9 +102,9 @@ class Tracker:
         """Pose near a predicted one: anchors of the last frame first, then the local map; None with too few
         inliers."""
         some = recent[:: 1 + len(recent) // ENOUGH_FOR_ROUGH]
-        first = self.refine(view, T_c_w, some, self.config.motion_radius_px, ROUGH, expected)
+        first = self.refine(view, T_c_w, some, MOTION_RADIUS_PX, ROUGH, expected)
         if first is None or first.inliers < self.config.min_inliers:
-            first = self.refine(view, T_c_w, recent, WIDER * self.config.motion_radius_px, ROUGH, expected)
+            first = self.refine(view, T_c_w, recent, WIDER * MOTION_RADIUS_PX, ROUGH, expected)
         if first is None or first.inliers < MIN_ROUGH:
             return None
         return self._complete(view, first.T_c_w, first.anchor, first.keypoint, first.anchor, expected)
@@ -113,7 +119,7 @@ class Tracker:
         """Keyframes that observe most of the given anchors."""
         counts = self.map.shared_counts(anchor_ids)
         ranked = sorted(counts, key=lambda id: (-counts[id], -id))
-        return [self.map.keyframes[id] for id in ranked[: self.config.local_keyframes]]
+        return [self.map.keyframes[id] for id in ranked[:LOCAL_KEYFRAMES]]
 
     def refine(
         self,
@@ -142,7 +148,7 @@ class Tracker:
         anchors = self.map.anchors
         seen = self.expected(T_c_w, self.map.anchors_seen_by(self.local_keyframes(recent)))
         new = seen.select(~np.isin(seen.anchor, anchor))
-        radius = self.config.map_radius_px * self.orb.scale_factor ** new.octave.astype(np.float64)
+        radius = MAP_RADIUS_PX * self.orb.scale_factor ** new.octave.astype(np.float64)
         matches = self._match(view, new, radius)
         free = ~np.isin(matches.train, keypoint)
         keypoint = np.concatenate([keypoint, matches.train[free]])
@@ -168,8 +174,6 @@ class Tracker:
             view.features.octave,
             view.grid,
             radius_px,
-            self.config.max_hamming,
-            self.config.ratio,
         )
 
     def solve(

@@ -57,7 +57,7 @@ class Pieces:
         self.map.refresh_anchors(anchor_of[known])
         self.keyframes = points.keyframes
         self.tracker = Tracker(self.map, CAMERA, OrbConfig(), TrackingConfig())
-        self.edges = EdgeMap(self.map, CAMERA, EdgeConfig(), 0.3)
+        self.edges = EdgeMap(self.map, CAMERA, EdgeConfig())
         self.log = TrajectoryLog(self.map)
         for keyframe in self.keyframes:
             self.log.append(keyframe.frame_index, keyframe.stamp_s, keyframe.id, keyframe.T_c_w, True)

@@ -30,7 +30,7 @@ class Flown:
         self.map = points.map
         self.map.begin_piece("first frame")
         points.fill()
-        self.edges = EdgeMap(self.map, CAMERA, EdgeConfig(), 0.3)
+        self.edges = EdgeMap(self.map, CAMERA, EdgeConfig())
         gone = points.keyframes[2]
         for keyframe in (gone, points.keyframes[4]):
             uv = rng.uniform(10, 400, (7, 2))
@@ -65,7 +65,7 @@ def seen(slam_map, camera=CAMERA):
 
 def restored(saved, camera=CAMERA):
     slam_map = SlamMap(SCALE_FACTOR)
-    edges = EdgeMap(slam_map, camera, EdgeConfig(), 0.3)
+    edges = EdgeMap(slam_map, camera, EdgeConfig())
     unpack(saved, slam_map, edges, camera)
     check_map(slam_map)
     return slam_map, edges

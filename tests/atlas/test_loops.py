@@ -91,7 +91,7 @@ class Ring:
         self.map.refresh_anchors(np.flatnonzero(anchors.alive))
         self.keyframes = list(self.map.keyframes.values())
         self.tracker = Tracker(self.map, CAMERA, OrbConfig(), TrackingConfig())
-        self.edges = EdgeMap(self.map, CAMERA, EdgeConfig(), 0.3)
+        self.edges = EdgeMap(self.map, CAMERA, EdgeConfig())
         self.log = TrajectoryLog(self.map)
         for keyframe in self.keyframes:
             near = se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])) @ keyframe.T_c_w

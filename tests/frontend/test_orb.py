@@ -61,7 +61,7 @@ def test_corners_of_every_pyramid_level_are_unbiased(rng):
 
     OpenCV's own positions are off by 0.5 to 1.5 px on the coarse levels, always up and to the left.
     """
-    config = OrbConfig(features=5000, candidates=5000)
+    config = OrbConfig(features=5000)
     off, octave = [], []
     for _ in range(12):
         image, corners = _squares(rng)

@@ -59,14 +59,14 @@ def test_network_depth_is_scaled_to_map_units(points):
     u, v = np.rint(keyframe.features.uv).astype(int).T
     depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = z / 3.0  # the network's metre is three map units
     keyframe.depth = DepthMap(depth, np.full((480, 640), 0.12, np.float32))
-    prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors, 0.35)
+    prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors)
     np.testing.assert_allclose(np.median(prior / z), 1.0, rtol=1e-5)
     np.testing.assert_allclose(sigma, np.hypot(0.12, 0.05), rtol=1e-6)
 
 
 def test_neighbouring_anchors_replace_a_missing_network(points):
     keyframe, z = points.keyframes[0], true_depth(points, 0)
-    prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors, 0.35)
+    prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors)
     assert (sigma == 0.35).all()
     assert prior.min() >= z.min() * 0.999
     assert prior.max() <= z.max() * 1.001
@@ -77,7 +77,7 @@ def test_neighbouring_anchors_replace_a_missing_network(points):
 def test_keyframe_without_anchors_has_a_wide_prior(points):
     keyframe = points.keyframes[0]
     keyframe.anchor[:] = -1
-    prior, sigma = depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors, 0.35)
+    prior, sigma = depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors)
     assert np.isnan(prior).all()
     assert np.isinf(sigma).all()
 
@@ -85,7 +85,7 @@ def test_keyframe_without_anchors_has_a_wide_prior(points):
 def test_anchors_behind_the_camera_do_not_count(points):
     keyframe = points.keyframes[0]
     keyframe.T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ keyframe.T_c_w
-    assert np.isnan(depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors, 0.35)[0]).all()
+    assert np.isnan(depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors)[0]).all()
 
 
 @pytest.mark.parametrize(("twist", "sigma_log"), [(0.0, 0.051), (0.3, 0.061)])
@@ -97,7 +97,7 @@ def test_a_wrong_network_is_corrected_by_anchors_with_a_larger_sigma(points, twi
     depth, sigma = np.full((480, 640), np.nan, np.float32), np.full((480, 640), 0.01, np.float32)
     depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = z * np.exp(error)
     keyframe.depth = DepthMap(depth, sigma)
-    prior, prior_sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors, 0.35)
+    prior, prior_sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors)
     known = np.isfinite(prior)
     left = np.abs(np.log(prior / z))[known]
     assert np.median(left) <= 0.5 * np.median(np.abs(error)) + 0.01
@@ -117,7 +117,7 @@ def relative_map(points, view, scale=0.7, shift=0.02):
 def test_relative_depth_is_fitted_by_scale_and_shift(points):
     keyframe, z = points.keyframes[0], true_depth(points, 0)
     keyframe.depth = relative_map(points, 0)
-    prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors, 0.35)
+    prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors)
     known = np.isfinite(prior)
     assert known.mean() > 0.9
     np.testing.assert_allclose(prior[known], z[known], rtol=0.02)
@@ -128,5 +128,5 @@ def test_anchors_from_relative_depth_do_not_fit_its_scale(points):
     keyframe = points.keyframes[0]
     keyframe.depth = relative_map(points, 0)
     points.map.anchors.from_depth[:] = True
-    _, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors, 0.35)
+    _, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors)
     np.testing.assert_allclose(sigma, 0.35)

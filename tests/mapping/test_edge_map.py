@@ -63,7 +63,7 @@ def points(rng):
 
 
 def edge_map(points, **settings):
-    return EdgeMap(points.map, CAMERA, EdgeConfig(**settings), 0.35)
+    return EdgeMap(points.map, CAMERA, EdgeConfig(**settings))
 
 
 def test_consistent_points_of_two_keyframes_count_twice(points):
@@ -138,7 +138,7 @@ def test_edges_of_one_cell_share_a_prior_near_their_own(points, rng):
     uv = rng.integers(0, (CAMERA.width, CAMERA.height), (600, 2)).astype(np.float32)
     keyframe = points.keyframes[0]
     prior, sigma = edge_map(points)._prior(keyframe, uv)
-    own, own_sigma = depth_prior(keyframe, uv, points.map.anchors, 0.35)
+    own, own_sigma = depth_prior(keyframe, uv, points.map.anchors)
     np.testing.assert_array_equal(sigma, own_sigma)
     assert np.median(np.abs(np.log(prior / own))) < 0.05
     _, cell = np.unique(uv // PRIOR_CELL_PX, axis=0, return_inverse=True)
@@ -195,7 +195,7 @@ def test_keyframes_without_a_measured_edge_are_an_empty_map(rng):
     """No median of an empty set: numpy's warning would fail the test."""
     points = PointMap(rng, 300, 3)
     points.fill()
-    edges = EdgeMap(points.map, CAMERA, EdgeConfig(), 0.35)
+    edges = EdgeMap(points.map, CAMERA, EdgeConfig())
     edges.hosts.append(host(points, 0, np.zeros((0, 3))))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -88,11 +88,12 @@ def test_new_anchors_that_are_not_found_again_are_removed(rng):
     check_map(points.map)
 
 
-def test_a_full_map_removes_keyframes_outside_the_window(rng):
+def test_a_full_map_removes_keyframes_outside_the_window(rng, monkeypatch):
     """Thirty cameras in a row: at most twice as many as wanted stay, and the removed ones keep their place."""
     points = PointMap(rng, 300, 30)
     anchor_of = points.fill([0, 1])
-    mapper = make_mapper(points, max_keyframes=12, window=5, window_fixed=5, redundancy=1.0)
+    monkeypatch.setattr("edgeslam_torch.mapping.mapper.REDUNDANCY", 1.0)
+    mapper = make_mapper(points, max_keyframes=12, window=5, window_fixed=5)
     for view in range(2, 30):
         before = set(points.map.keyframes)
         insert(mapper, points, view, anchor_of)
@@ -104,7 +105,7 @@ def test_a_full_map_removes_keyframes_outside_the_window(rng):
     assert np.abs([se3.log(t) for t in T]).max() < 0.01
 
 
-def test_the_only_views_of_a_place_are_kept_in_a_full_map(rng):
+def test_the_only_views_of_a_place_are_kept_in_a_full_map(rng, monkeypatch):
     """Two cameras share a place that no other one sees; the others see what others see, too."""
     points = PointMap(rng, 600, 30)
     points.fill()
@@ -113,28 +114,31 @@ def test_the_only_views_of_a_place_are_kept_in_a_full_map(rng):
     for keyframe in points.keyframes:
         mine = np.isin(keyframe.anchor, theirs) == (keyframe.id in home)
         points.map.forget_observations(keyframe, np.flatnonzero(~mine & (keyframe.anchor >= 0)))
-    mapper = make_mapper(points, max_keyframes=12, window=5, window_fixed=5, redundancy=1.0)
+    monkeypatch.setattr("edgeslam_torch.mapping.mapper.REDUNDANCY", 1.0)
+    mapper = make_mapper(points, max_keyframes=12, window=5, window_fixed=5)
     mapper.cull_keyframes(points.keyframes[-1])
     assert home <= set(points.map.keyframes) and len(points.map.keyframes) == 12
     check_map(points.map)
 
 
-def test_a_map_of_unique_views_grows_to_twice_the_limit(rng):
+def test_a_map_of_unique_views_grows_to_twice_the_limit(rng, monkeypatch):
     points = PointMap(rng, 900, 30)
     points.fill()
     for keyframe in points.keyframes:  # each anchor is left to two neighbours
         others = keyframe.anchor % 15 != keyframe.id // 2
         points.map.forget_observations(keyframe, np.flatnonzero((keyframe.anchor >= 0) & others))
-    mapper = make_mapper(points, max_keyframes=12, window=5, window_fixed=5, redundancy=1.0)
+    monkeypatch.setattr("edgeslam_torch.mapping.mapper.REDUNDANCY", 1.0)
+    mapper = make_mapper(points, max_keyframes=12, window=5, window_fixed=5)
     mapper.cull_keyframes(points.keyframes[-1])
     assert len(points.map.keyframes) == 24
 
 
-def test_redundant_keyframes_are_removed_except_the_first_and_last(rng):
+def test_redundant_keyframes_are_removed_except_the_first_and_last(rng, monkeypatch):
     """Every point is seen from almost everywhere: of sixteen keyframes a few would do."""
     points = PointMap(rng, 300, 16)
     anchor_of = points.fill([0, 1])
-    mapper = make_mapper(points, redundancy=0.6)
+    monkeypatch.setattr("edgeslam_torch.mapping.mapper.REDUNDANCY", 0.6)
+    mapper = make_mapper(points)
     for view in range(2, 16):
         insert(mapper, points, view, anchor_of)
     check_map(points.map)
@@ -155,7 +159,7 @@ def test_keyframe_without_covisible_ones_is_inserted(rng):
     assert 2 in points.map.keyframes
 
 
-@pytest.mark.parametrize("settings", [{"window": 1}, {"max_keyframes": 10}, {"keyframe_overlap": 1.0}])
+@pytest.mark.parametrize("settings", [{"window": 1}, {"max_keyframes": 10}, {"keyframe_parallax_deg": 0.0}])
 def test_settings_out_of_range_are_rejected(settings):
     with pytest.raises(ValueError, match="must be"):
         MappingConfig(**settings)

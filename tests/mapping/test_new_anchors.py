@@ -23,7 +23,7 @@ def depth_of(points, view):
 def matched(points, prior_depth, sigma_log=0.35):
     a, b = points.keyframes[0], points.keyframes[1]
     sigma = np.full(len(prior_depth), sigma_log)
-    return epipolar_matches(a, b, CAMERA, prior_depth, sigma, SCALE_FACTOR, 64, 0.85)
+    return epipolar_matches(a, b, CAMERA, prior_depth, sigma, SCALE_FACTOR)
 
 
 def triangulated(points, matches, min_parallax_deg=1.0):
@@ -119,7 +119,7 @@ def test_a_similar_keypoint_off_the_epipolar_line_is_not_matched(points, rng):
     features = FrameFeatures(uv, none, none.astype(np.float32), descriptors)
     twins = make_keyframe(1, 10, 1.0, b.T_c_w, features)
     sigma = np.full(len(depth), 0.05)
-    found = epipolar_matches(a, twins, CAMERA, depth, sigma, SCALE_FACTOR, 64, 0.85)
+    found = epipolar_matches(a, twins, CAMERA, depth, sigma, SCALE_FACTOR)
     right = dict(zip(at_a.tolist(), range(n), strict=True))
     chosen = [right[q] == t for q, t in zip(found.query.tolist(), found.train.tolist(), strict=True) if t < 2 * n]
     assert len(chosen) > 0.7 * n

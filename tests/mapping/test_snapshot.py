@@ -43,7 +43,7 @@ def slam(points):
     """A system with a map of known points, 30 edges of each keyframe, numbered by their colour."""
     slam = EdgeSlam(CAMERA, SlamConfig(depth=DepthConfig(weights="none")))
     slam.map = points.map
-    slam.edges = EdgeMap(points.map, CAMERA, EdgeConfig(voxel=1e-6), 0.35)
+    slam.edges = EdgeMap(points.map, CAMERA, EdgeConfig(voxel=1e-6))
     slam.edges.hosts += [host(points, id) for id in range(3)]
     slam.log = TrajectoryLog(points.map)
     slam.log.append(0, 0.0, 2, points.map.pose_of(2), True)  # the camera is in the piece of map that is shown
@@ -91,7 +91,7 @@ def test_concurrent_reading_never_sees_partly_thinned_edges(slam, points):
             self.sigma, self.colour, self.observations = (x[mask] for x in (self.sigma, self.colour, self.observations))
             return int((~mask).sum())
 
-    slam.edges = EdgeMap(points.map, CAMERA, EdgeConfig(voxel=1e-6, max_points=1000), 0.35)
+    slam.edges = EdgeMap(points.map, CAMERA, EdgeConfig(voxel=1e-6, max_points=1000))
     slam.edges.hosts += [host(points, i % 3, Thinned) for i in range(33)]
     slam.edges.add(host(points, 0, Thinned))
     assert sum(len(h.uv) for h in slam.edges.hosts) <= 1000

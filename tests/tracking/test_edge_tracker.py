@@ -24,7 +24,7 @@ def tracker_on(image, depth_m, T_w_c):
     slam_map = SlamMap(1.2)
     keyframe = make_keyframe(0, 0, 0.0, se3.inverse(T_w_c), OrbExtractor(OrbConfig(), CAMERA)(grey))
     slam_map.add_keyframe(keyframe)
-    edges = EdgeMap(slam_map, CAMERA, EdgeConfig(), 0.35)
+    edges = EdgeMap(slam_map, CAMERA, EdgeConfig())
     found = extract_edges(grey, 40.0, 100.0, 4000)
     u, v = found.uv.astype(int).T
     z = cv2.erode(depth_m, np.ones((5, 5)))[v, u].astype(np.float64)  # an outline belongs to what is nearer
@@ -124,7 +124,7 @@ def test_a_blank_image_and_an_empty_map_give_nothing(tracker, flight, grey):
     T_c_w = se3.inverse(flight.T_w_c[0])
     assert tracker.refine(np.full((240, 320), grey, np.uint8), T_c_w) is None
     empty = SlamMap(1.2)
-    assert EdgeTracker(empty, EdgeMap(empty, CAMERA, EdgeConfig(), 0.35), CAMERA).refine(STRIPES, T_c_w) is None
+    assert EdgeTracker(empty, EdgeMap(empty, CAMERA, EdgeConfig()), CAMERA).refine(STRIPES, T_c_w) is None
 
 
 def test_edges_help_few_and_noisy_points(flight, tracker, rng):

@@ -16,6 +16,8 @@ from edgeslam_torch.map.keyframe import NO_ANCHOR, make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.tracking.flow import (
+    LEVELS,
+    MIN_SHARE,
     NEAR_LEVELS,
     FlowTracker,
     join,
@@ -26,7 +28,7 @@ from edgeslam_torch.tracking.flow import (
 from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
 from edgeslam_torch.tracking.tracker import Track, make_view
 
-ORB = OrbConfig(features=500, candidates=800)
+ORB = OrbConfig(features=500)
 MIN_INLIERS = 25
 POSES = sideways(4, 0.05, turn_rad=0.01)
 
@@ -98,24 +100,25 @@ def test_the_number_of_tracked_keypoints_is_limited_and_they_are_spread(scene):
     assert len({(int(u // 80), int(v // 80)) for u, v in uv}) >= 11  # cells of a 4 x 3 grid
 
 
-def test_keypoints_out_of_view_count_against_the_share(scene):
+def test_keypoints_out_of_view_count_against_the_share(scene, monkeypatch):
     """Turned until a part has left the image: what is left tells the pose, and the share that it is less."""
     turned = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, 0.3, 0]))
     here = scene.tracker().follow(scene.template, scene.grey, scene.keyframe.T_c_w)
-    followed = scene.tracker(min_share=0.2).follow(scene.template, grey_at(turned), se3.inverse(turned))
+    monkeypatch.setattr("edgeslam_torch.tracking.flow.MIN_SHARE", 0.2)
+    followed = scene.tracker().follow(scene.template, grey_at(turned), se3.inverse(turned))
     assert followed.share < here.share - 0.2
     assert error(followed.track.T_c_w, turned)[0] < 0.01
-    assert lost_sight(followed, MappingConfig())
-    assert not lost_sight(replace(followed, share=1.0), MappingConfig())
-    assert not lost_most(replace(followed, share=0.85), MappingConfig())
-    assert lost_most(replace(followed, share=0.6), MappingConfig())
+    assert lost_sight(followed)
+    assert not lost_sight(replace(followed, share=1.0))
+    assert not lost_most(replace(followed, share=0.85))
+    assert lost_most(replace(followed, share=0.6))
 
 
 def test_a_pose_uses_the_keypoints_in_view(scene):
     """A third of the template is left, and nearly all of that is found: no reason to be lost."""
     turned = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, 0.75, 0]))
     followed = scene.tracker().follow(scene.template, grey_at(turned), se3.inverse(turned))
-    assert followed.share < scene.tracker().config.min_share
+    assert followed.share < MIN_SHARE
     assert followed.trusted
     assert error(followed.track.T_c_w, turned)[0] < 0.02
 
@@ -128,7 +131,7 @@ def test_few_inliers_in_view_give_a_prediction_but_no_pose(scene):
     before = scene.map.anchors.visible.copy()
     followed = scene.tracker().follow(scene.template, grey, scene.keyframe.T_c_w)
     assert not followed.trusted
-    assert followed.share < scene.tracker().config.min_share
+    assert followed.share < MIN_SHARE
     assert error(followed.track.T_c_w, POSES[0])[0] < 0.05
     np.testing.assert_array_equal(scene.map.anchors.visible, before)
 
@@ -145,7 +148,7 @@ def test_all_pyramid_levels_are_used_only_if_they_find_more(scene, monkeypatch):
 
     monkeypatch.setattr(FlowTracker, "_locate", locate)
     followed = tracker.follow(scene.template, scene.grey, scene.keyframe.T_c_w)
-    assert tried == [NEAR_LEVELS, tracker.config.levels]
+    assert tried == [NEAR_LEVELS, LEVELS]
     assert 0.4 < followed.share < 0.55
 
 
@@ -275,11 +278,11 @@ def test_few_matches_is_decided_by_stable_anchors(scene):
     """With three keyframes, none of 500 anchors seen by a single keyframe counts."""
     ids = scene.keyframe.anchor
     track = Track(scene.keyframe.T_c_w, np.arange(30), ids[:30], np.arange(30), ids[:30], np.eye(6))
-    assert few_matches(track, scene.keyframe, scene.map, MappingConfig())
+    assert few_matches(track, scene.keyframe, scene.map)
     for id in (1, 2):
         other = make_keyframe(id, id, float(id), se3.inverse(POSES[id]), scene.keyframe.features)
         scene.map.add_keyframe(other)
-    assert not few_matches(track, scene.keyframe, scene.map, MappingConfig())
+    assert not few_matches(track, scene.keyframe, scene.map)
 
 
 def test_keypoints_are_selected_again_when_the_map_changes(scene):
@@ -295,11 +298,12 @@ def test_keypoints_are_selected_again_when_the_map_changes(scene):
     assert np.isin(ids, tracker.follow(scene.template, scene.grey, at).track.matched_anchor).sum() > 40
 
 
-def test_dissimilar_patches_are_rejected(scene, rng):
+def test_dissimilar_patches_are_rejected(scene, rng, monkeypatch):
     """The left half of the frame is noise: flow ends somewhere there too, but nothing of it counts as found."""
     image = scene.grey.copy()
     image[:, :160] = rng.integers(0, 256, (240, 160), dtype=np.uint8)
-    followed = scene.tracker(min_share=0.2, points=1000).follow(scene.template, image, scene.keyframe.T_c_w)
+    monkeypatch.setattr("edgeslam_torch.tracking.flow.MIN_SHARE", 0.2)
+    followed = scene.tracker(points=1000).follow(scene.template, image, scene.keyframe.T_c_w)
     looked_for = scene.keyframe.features.uv[scene.keyframe.keypoints_with_anchor()]
     found = scene.keyframe.features.uv[followed.track.matched_keypoint]
     assert (found[:, 0] > 170).sum() > 0.9 * (looked_for[:, 0] > 170).sum()

@@ -14,7 +14,7 @@ from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking import bootstrap as bootstrap_module
 from edgeslam_torch.tracking.bootstrap import WITNESS_SHARE, Bootstrap
-from edgeslam_torch.tracking.initialiser import BootstrapView, poses_of_witnesses, two_view_map
+from edgeslam_torch.tracking.initialiser import MIN_POINTS, BootstrapView, poses_of_witnesses, two_view_map
 from edgeslam_torch.tracking.tracker import Tracker, make_view
 from edgeslam_torch.types import DepthMap, Frame, FrameFeatures
 
@@ -128,8 +128,14 @@ def test_an_intermediate_frame_without_matches_keeps_its_pose_and_is_ignored(poi
     assert poses_of_witnesses([], nothing, CAMERA) == ([], 1.0)
 
 
+@pytest.fixture(autouse=True)
+def wide_search(monkeypatch):
+    """The views lie farther apart than successive frames."""
+    monkeypatch.setattr("edgeslam_torch.tracking.bootstrap.MOTION_RADIUS_PX", 100.0)
+
+
 def make_bootstrap(points, guess_depth, config=CONFIG, corner=None):
-    tracker = Tracker(points.map, CAMERA, OrbConfig(), TrackingConfig(motion_radius_px=100.0))
+    tracker = Tracker(points.map, CAMERA, OrbConfig(), TrackingConfig())
     reference = points.keyframes[0]
     colour = np.zeros((len(reference.anchor), 3), np.uint8)
     guess = np.stack([guess_depth, np.full(len(guess_depth), 0.35)], axis=1)
@@ -188,7 +194,7 @@ def started(points, **config):
 def test_guessed_map_is_replaced_and_the_map_stays_consistent(points):
     between = started(points, keyframe_gap_s=100.0).T_c_w
     alive = np.flatnonzero(points.map.anchors.alive)
-    assert len(alive) >= CONFIG.min_points
+    assert len(alive) >= MIN_POINTS
     assert not points.map.anchors.from_depth[alive].any()
     index = {points.keyframes[v].frame_index: v for v in (1, 2, 3)}
     np.testing.assert_array_equal(between.pop(points.keyframes[0].frame_index), points.keyframes[0].T_c_w)
@@ -203,12 +209,13 @@ def test_guessed_map_is_replaced_and_the_map_stays_consistent(points):
 
 
 @pytest.mark.parametrize("network", [False, True])
-def test_without_a_network_two_views_need_a_smaller_sigma(points, network):
+def test_without_a_network_two_views_need_a_smaller_sigma(points, network, monkeypatch):
     """With a network a flat scene is recognised; without one, the baseline direction must be certain."""
     if network:
         flat = np.ones((CAMERA.height, CAMERA.width), np.float32)
         points.keyframes[0].depth = DepthMap(flat, 0.2 * flat)
-    _, accepted = attempted(points, max_direction_sigma_alone=1e-9)
+    monkeypatch.setattr("edgeslam_torch.tracking.bootstrap.MAX_DIRECTION_SIGMA_ALONE", 1e-9)
+    _, accepted = attempted(points)
     assert accepted.ok == network
     assert network or accepted.reason == "rotation and translation are not yet distinguishable"
 

@@ -20,6 +20,10 @@ from edgeslam_torch.types import FloatArray, IntArray, PointCloud
 
 AGREE_DEPTH = 0.04
 """Maximum relative depth difference of the same edge in two keyframes."""
+DELAY_KEYFRAMES = 3
+"""Number of later keyframes before a keyframe's edges are measured, so that refined views from both sides exist."""
+TARGETS = 5
+"""Keyframes searched for each edge."""
 RECENT_HOSTS = 40
 """Number of latest keyframes compared with a new one."""
 CHECKED = 100
@@ -68,11 +72,10 @@ class EdgePoints:
 class EdgeMap:
     """Measures and stores the edges of keyframes; modified under the map's lock only."""
 
-    def __init__(self, slam_map: SlamMap, camera: Camera, config: EdgeConfig, unknown_sigma_log: float) -> None:
+    def __init__(self, slam_map: SlamMap, camera: Camera, config: EdgeConfig) -> None:
         self.map = slam_map
         self.camera = camera
         self.config = config
-        self.unknown_sigma_log = unknown_sigma_log
         self.hosts: list[EdgePoints] = []
         self._waiting: list[int] = []
 
@@ -82,7 +85,7 @@ class EdgeMap:
 
     def update(self, everything: bool = False) -> None:
         """Measure the keyframes that are due, or all of them."""
-        keep = 0 if everything else self.config.delay_keyframes
+        keep = 0 if everything else DELAY_KEYFRAMES
         while len(self._waiting) > keep:
             keyframe = self.map.keyframes.get(self._waiting.pop(0))
             if keyframe is not None:  # it may have been culled meanwhile
@@ -196,7 +199,7 @@ class EdgeMap:
         u, v = (uv // PRIOR_CELL_PX).astype(np.int64).T
         cells, cell_of = np.unique(v * across + u, return_inverse=True)
         middle = np.stack([cells % across, cells // across], axis=1) * PRIOR_CELL_PX + (PRIOR_CELL_PX - 1) / 2
-        prior, sigma = depth_prior(keyframe, middle, self.map.anchors, self.unknown_sigma_log)
+        prior, sigma = depth_prior(keyframe, middle, self.map.anchors)
         return prior[cell_of], sigma[cell_of]
 
     def _bound(self) -> None:
@@ -218,14 +221,14 @@ class EdgeMap:
         """Covisible keyframes whose baseline is long enough for parallax and short enough for similar appearance."""
         depth = self.map.median_depth(keyframe) or 1.0
         chosen = []
-        for other in self.map.covisible(keyframe, 4 * self.config.targets, min_shared=30):
+        for other in self.map.covisible(keyframe, 4 * TARGETS, min_shared=30):
             baseline = float(np.linalg.norm(other.centre_w - keyframe.centre_w)) / depth
             if other.grey is not None and 0.02 < baseline < 0.5:
                 chosen.append(other)
-        return chosen[: self.config.targets]
+        return chosen[:TARGETS]
 
     def _overlapping(self, keyframe: Keyframe, hosts: list[EdgePoints]) -> list[EdgePoints]:
-        near = {k.id for k in self.map.covisible(keyframe, 3 * self.config.targets)}
+        near = {k.id for k in self.map.covisible(keyframe, 3 * TARGETS)}
         return [h for h in hosts if h.keyframe_id in near][-8:]
 
     def _agreeing(self, points: EdgePoints, others: list[EdgePoints]) -> Iterator[tuple[IntArray, IntArray]]:
