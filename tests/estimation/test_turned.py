@@ -49,7 +49,7 @@ def test_attitude_of_another_flight_tells_nothing(rng, swinging, replay):
     assert all(one is None for one in told)
 
 
-@pytest.mark.parametrize("missing", ["silent", "repeated"])
+@pytest.mark.parametrize("missing", [pytest.param("silent", marks=pytest.mark.slow), "repeated"])
 def test_a_moment_without_telemetry_tells_nothing(rng, swinging, replay, missing):
     def hole(samples):
         last = next(s for s in samples if s.stamp_s > 15.0 and np.abs(s.velocity_m_s).max() > 0.15)
@@ -63,6 +63,7 @@ def test_a_moment_without_telemetry_tells_nothing(rng, swinging, replay, missing
     assert any(one is not None for one in told)
 
 
+@pytest.mark.slow
 def test_a_camera_that_was_long_lost_is_told_nothing(rng, swinging, replay):
     told = asked(rng, swinging(30.0), replay, untracked_s=(14.0, 22.0))
     after = round((20.0 - PROVEN_S) * 20.0)

@@ -104,11 +104,6 @@ def test_wrong_file_is_explained(tmp_path, text, words):
         load_config(Outer(), tmp_path / "c.toml")
 
 
-def test_missing_file(tmp_path):
-    with pytest.raises(ConfigError, match="nowhere.toml: No such file"):
-        load_config(Outer(), tmp_path / "nowhere.toml")
-
-
 def test_options_win_over_the_file(tmp_path):
     (tmp_path / "c.toml").write_text("seed = 1\n[inner]\ncount = 5\n")
     config = load_config(Outer(), tmp_path / "c.toml", ["seed=2"])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from edgeslam_torch.errors import CalibrationError
-from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.camera_file import load_camera, save_camera
 
 GOOD = "width: 640\nheight: 480\nfx: 500\nfy: 501\ncx: 320\ncy: 240\n"
@@ -80,11 +80,3 @@ def test_an_invalid_file_is_rejected_by_name(tmp_path, text, words):
 def test_a_lens_without_description_has_no_distortion(tmp_path, line):
     (tmp_path / "c.yaml").write_text(GOOD + line)
     assert not load_camera(tmp_path / "c.yaml").is_distorted
-
-
-def test_scaled_camera_sees_the_same_rays():
-    camera = Camera(640, 480, 500.0, 510.0, 300.0, 250.0)
-    half = camera.scaled(320, 240)
-    # the corner of the image (pixel centres at integers: -0.5) stays the corner
-    assert (-0.5 - half.cx) / half.fx == pytest.approx((-0.5 - camera.cx) / camera.fx)
-    assert (239.5 - half.cy) / half.fy == pytest.approx((479.5 - camera.cy) / camera.fy)

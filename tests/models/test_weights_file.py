@@ -149,15 +149,6 @@ def test_widths_that_cannot_be_added_are_refused(tmp_path):
     refused(tmp_path / "w.safetensors", r"conv1 \(8\) cannot be added to decode_conv4 \(4\)")
 
 
-def test_a_network_far_beyond_any_fastdepth_is_refused(tmp_path, file):
-    """Its bytes would have to be there; a header alone cannot make us build 40 GB."""
-    shapes = parameter_shapes(Variant.SKIPADD, Widths((4096,) * 14, (4096,) * 5), True)
-    file.header = {"__metadata__": file.header["__metadata__"]}
-    for name, shape in shapes.items():
-        file.header[name] = {"dtype": "F32", "shape": shape, "data_offsets": [0, 4 * int(np.prod(shape))]}
-    refused(file.write(tmp_path / "w.safetensors"), "bytes of .* are missing|wrongly")
-
-
 # -- the record --------------------------------------------------------------------------------------------------
 
 WRONG = [None, [], {}, "text", "", -32, 1e5, float("nan"), float("inf"), True, 10**400, [[[]]], {"a": []}]
@@ -235,34 +226,16 @@ def test_an_impossible_record_cannot_be_written():
 @pytest.mark.parametrize(
     ("header", "match"),
     [
-        (b"", "not JSON"),
         (b"[]", "header is no table"),
-        (b"[" * 100_000, "not JSON"),
         (b'{"conv0.0.weight": 3}', "describes 'conv0.0.weight' wrongly"),
-        (b'{"a": {"dtype": "F32", "shape": [1], "data_offsets": [0]}}', "wrongly"),
-        (b'{"a": {"dtype": "F32", "shape": [-1], "data_offsets": [0, 4]}}', "wrongly"),
-        (b'{"a": {"dtype": "F32", "shape": [1.0], "data_offsets": [0, 4]}}', "wrongly"),
-        (b'{"a": {"dtype": "F32", "shape": ["x"], "data_offsets": [0, 4]}}', "wrongly"),
-        (b'{"a": {"dtype": ["F32"], "shape": [1], "data_offsets": [0, 4]}}', "holds"),
-        (b'{"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 1e999]}}', "wrongly"),
-        (b'{"a": {"dtype": "F32", "shape": [3000000000], "data_offsets": [0, 12000000000]}}', "wrongly"),
-        (b'{"a": {"dtype": "F32", "shape": [2], "data_offsets": [0, 4]}}', "are missing"),
-        (b'{"a": {"dtype": "F32", "shape": [9], "data_offsets": [0, 36]}}', "are missing"),
         (b'{"__metadata__": {"edgeslam": [1]}}', "metadata cannot be used"),
         (b'{"__metadata__": [1]}', "not a FastDepth checkpoint"),
-        (b"\xff\xfe", "not JSON"),
     ],
 )
 def test_a_header_that_makes_no_sense_is_refused(tmp_path, header, match):
     path = tmp_path / "w.safetensors"
     path.write_bytes(struct.pack("<Q", len(header)) + header + bytes(8))
     refused(path, match)
-
-
-@pytest.mark.parametrize("length", [0, 1 << 20, (1 << 20) + 1, 1 << 40, (1 << 64) - 1])
-def test_a_header_of_any_claimed_length_is_refused(tmp_path, length):
-    (tmp_path / "w.safetensors").write_bytes(struct.pack("<Q", length) + b'{"a": 1}')
-    refused(tmp_path / "w.safetensors", "damaged")
 
 
 def test_empty_missing_and_foreign_files_are_named(tmp_path):
@@ -274,13 +247,6 @@ def test_empty_missing_and_foreign_files_are_named(tmp_path):
     with (tmp_path / "huge").open("wb") as huge:
         huge.truncate(1 << 33)
     refused(tmp_path / "huge", "8192 MiB, more than any network")
-
-
-def test_truncated_anywhere_is_refused(whole, tmp_path, rng):
-    for cut in (1, 7, 8, 9, 1000, len(whole) - 1, *rng.integers(0, len(whole), 30)):
-        (tmp_path / "w").write_bytes(whole[:cut])
-        with pytest.raises(WeightsError, match=str(tmp_path / "w")):
-            read_weights(tmp_path / "w")
 
 
 def test_random_damage_is_refused_or_harmless(whole, tmp_path, rng):

@@ -18,7 +18,6 @@ WRITTEN = {
     "lossy.webp": [cv2.IMWRITE_WEBP_QUALITY, 80],
     "lossless.webp": [cv2.IMWRITE_WEBP_QUALITY, 101],
 }
-BIG_ENDIAN_TIFF = b"MM\0*\0\0\0\x08\0\x02" + b"\x01\0\0\x03\0\0\0\x01\0\x40\0\0" + b"\x01\x01\0\x04\0\0\0\x01\0\0\0\x30"
 
 
 def encoded(name, options, width=67, height=45):

@@ -361,12 +361,6 @@ def test_stamps_in_another_unit_than_their_name_says_are_said(tmp_path):
     assert any("milliseconds" in warning for warning in said)
 
 
-def test_utf_16_and_tabs_are_read(tmp_path):
-    path = tmp_path / "telemetry.csv"
-    path.write_text("stamp_s\tyaw\n0,5\t1\n0,6\t2\n", encoding="utf-16")
-    np.testing.assert_allclose(read_table(path).stamps_s, [0.5, 0.6])
-
-
 def test_rows_without_a_readable_time_name_the_column(tmp_path):
     with pytest.raises(TelemetryError, match="'stamp_s'.*noon"):
         read_telemetry(write(tmp_path, "stamp_s,yaw\n" + "noon,1\n" * 160))
