@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.errors import OutputError
-from edgeslam_torch.files.output_file import add_overwrite_to, check_new
+from edgeslam_torch.files.output_file import add_overwrite_to, check_new, check_not_read
 from edgeslam_torch.files.plain import subfolder
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ def main(args: argparse.Namespace) -> int:
     run = open_run(args.run)
     if args.out is not None:
         for path in _files(args.out, args.format):
+            check_not_read(path, [args.run] if path.suffix != ".png" else [], "--out")
             check_new(path, args.overwrite)
     cloud = _chosen(run, args)
     try:

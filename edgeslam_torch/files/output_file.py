@@ -15,9 +15,12 @@ from edgeslam_torch.errors import OutputError
 
 _PARTS = re.compile(
     r"trajectory.*\.txt|status\.csv|summary\.json|(edge_map|anchors)\.ply|observations\.npz"
-    r"|(rgb|depth|times|groundtruth|accelerometer)\.txt|(telemetry|imu|data)\.csv|(imu|sensor|metadata)\.yaml"
+    r"|(rgb|depth|times|groundtruth|accelerometer)\.txt|(telemetry|imu|data)\.csv|(camera|imu|sensor|metadata)\.yaml"
+    r"|.*\.(bag|db3|mcap)"
 )
 """Names of the files that runs and recordings consist of."""
+_PICTURE = re.compile(r"(?i).*\.(png|jpe?g|bmp|tiff?|p[gp]m|webp|mp4|mov|avi|mkv)")
+"""Those of recordings that lie in folders of their own."""
 
 STDOUT = Path("-")
 """Printed, where a command offers it."""
@@ -48,7 +51,7 @@ def check_outputs(parser: argparse.ArgumentParser, args: argparse.Namespace) -> 
         OutputError: If one exists and may not be replaced.
     """
     actions = {a.dest: a for each in _parsers(parser) for a in each._actions if a.type is output_file}
-    read = [path for name, value in vars(args).items() if name not in actions for path in _paths(value)]
+    read = [path for name, value in vars(args).items() if name not in (*actions, "out") for path in _paths(value)]
     named: list[Path] = []
     for dest, action in actions.items():
         path: Path | None = getattr(args, dest, None)
@@ -58,18 +61,30 @@ def check_outputs(parser: argparse.ArgumentParser, args: argparse.Namespace) -> 
         if any(_same(path, other) for other in named):
             raise OutputError(f"{path}: given twice; give another file to {option}")
         named.append(path)
-        check_not_read(path, read, option)
+        made = action.default is not None and path.name == action.default.name  # by an earlier call
+        check_not_read(path, read, option, made)
         check_new(path, args.overwrite, option)
 
 
-def check_not_read(path: Path, read: Iterable[str | Path], option: str) -> None:
+def check_not_read(path: Path, read: Iterable[str | Path], option: str, made: bool = False) -> None:
     """Check that a file to write is none of those read, and no part of a run or recording among them.
+
+    Args:
+        path: The file.
+        read: Files and folders that the command reads.
+        option: Where the file comes from.
+        made: Whether a file of this name is what the command makes and not what it reads.
 
     Raises:
         OutputError: If it is.
     """
-    is_part = _PARTS.fullmatch(path.name) is not None and path.exists()
-    if any(_same(path, other) or (is_part and _same(path.parent, other)) for other in read):
+    places = [path]
+    if path.exists() and not made:
+        if _PICTURE.fullmatch(path.name):
+            places += path.parents
+        elif _PARTS.fullmatch(path.name):
+            places.append(path.parent)
+    if any(_same(place, other) for other in read for place in places):
         raise OutputError(f"{path}: is what the command reads; give another file to {option}")
 
 

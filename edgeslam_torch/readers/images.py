@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.time_units import UNKNOWN, is_date, seconds_of
 from edgeslam_torch.readers.image_size import image_size
-from edgeslam_torch.readers.levels import FIRST, Levels, levels_of
+from edgeslam_torch.readers.levels import Levels, levels_of
 from edgeslam_torch.readers.listing import ImageEntry, Problem, entries_in_time, in_order
 from edgeslam_torch.types import FloatArray, Frame
 
@@ -240,7 +240,7 @@ def frames_of(entries: Sequence[ImageEntry], size: tuple[int, int], problems: li
 
     @cache
     def levels() -> Levels:
-        found = levels_of(_deep(entries[at : at + FIRST]))
+        found = levels_of(_deep(entries[at:]))
         problems.append(Problem(str(entries[at].path.parent), f"more than 8 bits: {found.words}", frames=0))
         return found
 

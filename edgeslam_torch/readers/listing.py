@@ -136,7 +136,7 @@ def in_order(entries: Sequence[ImageEntry], name: str) -> tuple[list[ImageEntry]
             f"{name}: {len(entries)} images have only {different} different stamps, such as {stamps[0]:.6f}; each "
             "image needs its own (were their decimals cut off?)"
         )
-    keep = _longest_increasing(stamps)
+    keep = longest_increasing(stamps)
     if len(keep) < 0.9 * len(entries) and np.any(np.diff(stamps) < 0):
         falls = bool(np.all(np.diff(stamps) <= 0))
         order = "from the last to the first" if falls else "in no order of their stamps"
@@ -153,7 +153,7 @@ def in_order(entries: Sequence[ImageEntry], name: str) -> tuple[list[ImageEntry]
     return [entries[i] for i in keep], problems
 
 
-def _longest_increasing(values: FloatArray) -> IntArray:
+def longest_increasing(values: FloatArray) -> IntArray:
     """Indices of a longest strictly increasing subsequence (patience sorting)."""
     tails: list[float] = []
     tail_index: list[int] = []

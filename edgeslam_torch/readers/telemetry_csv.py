@@ -18,8 +18,9 @@ from edgeslam_torch.drone.sdk_state import FIELDS, sample_from_sdk
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.files import tables
 from edgeslam_torch.files.appender import Appender
-from edgeslam_torch.files.time_units import NAMES, UNKNOWN, seconds_of
+from edgeslam_torch.files.time_units import NAMES, SECONDS_PER_UNIT, UNKNOWN, seconds_of
 from edgeslam_torch.files.units import known_units
+from edgeslam_torch.readers.listing import longest_increasing
 from edgeslam_torch.readers.logs.columns import QUANTITIES, column_of, unit_factor
 from edgeslam_torch.readers.logs.foreign import foreign_log
 from edgeslam_torch.readers.velocity_frame import body_frame_evidence
@@ -28,24 +29,11 @@ from edgeslam_torch.types import FloatArray, TelemetrySample
 logger = logging.getLogger(__name__)
 
 HEADER = ("stamp_s", *FIELDS)
+_CLOCKS = ("timestamp", "time_stamp", "stamp", "t", "ts", "datetime", "date_time", "time")
 _STAMPS = {
-    "stamp_s": 1.0,
-    "time_s": 1.0,
-    "timestamp_s": 1.0,
-    "timestamp_ms": 1e-3,
-    "time_ms": 1e-3,
-    "stamp_ms": 1e-3,
+    **{f"{clock}_{unit}": factor for unit, factor in SECONDS_PER_UNIT.items() for clock in _CLOCKS},
     "ms": 1e-3,
-    "timestamp_us": 1e-6,
-    "timestamp_ns": 1e-9,
-    "timestamp": 0.0,
-    "time_stamp": 0.0,
-    "stamp": 0.0,
-    "t": 0.0,
-    "ts": 0.0,
-    "datetime": 0.0,
-    "date_time": 0.0,
-    "time": 0.0,
+    **dict.fromkeys(_CLOCKS, 0.0),
 }
 """Column names of the clock, most reliable first; factor 0: unit inferred from the spacing. The SDK's ``time`` counts
 whole seconds of motor time and is the last resort."""
@@ -138,7 +126,7 @@ def read_telemetry(path: Path, units: TelemetryUnits | None = None) -> tuple[lis
         logger.info(
             "%s: velocities: %s; %s", path, units.evidence, units.frame_evidence or "frame: SDK default (world)"
         )
-    return table.samples(units), table.warnings(path.name)
+    return table.samples(units), [*table.warnings(path.name), *_assumed_units(table, units, path.name)]
 
 
 def read_table(path: Path) -> TelemetryTable:
@@ -166,8 +154,9 @@ def read_table(path: Path) -> TelemetryTable:
                 raise TelemetryError(f"{path}: the unit of column {text.header[i]!r} is not known: {units}")
             columns.setdefault(known[0], _Column(i, *known))
     if clock is None or not columns:
-        missing = f"no clock ({', '.join(_STAMPS)})" if clock is None else f"no known column ({', '.join(FIELDS)})"
-        raise TelemetryError(f"{path}: {missing} in its header line; give a telemetry.csv")
+        what, known_names = ("clock", _CLOCKS) if clock is None else ("known column", FIELDS)
+        missing = f"no {what} ({', '.join(known_names)}) in its header line"
+        raise TelemetryError(f"{path}: {missing}; give a telemetry.csv")
     at = names.index(clock)
     rows, skipped = _rows(text.rows, len(names), at, list(columns.values()))
     if text.rows and not rows:
@@ -220,20 +209,22 @@ def _plain(name: str) -> str:
 def _rows(
     lines: Sequence[tables.Row], width: int, clock: int, columns: Sequence[_Column]
 ) -> tuple[list[list[float]], int]:
-    rows: list[list[float]] = []
-    skipped, last, turns = 0, -math.inf, 0.0
+    """Stamps and values in time order, and the number of skipped rows: a wild stamp costs one."""
+    stamps: list[float] = []
+    timed: list[list[str]] = []
+    last, turns = -math.inf, 0.0
     for line in lines:
         cells = line.cells[:-1] if len(line.cells) == width + 1 and not line.cells[-1] else line.cells
         stamp, period = _moment(cells[clock]) if len(cells) == width else (math.nan, _WRAP)
         if stamp + turns < last - 0.5 * period and last - turns <= period:  # the clock began anew
             turns += period
-        stamp += turns
-        if not stamp > last or abs(stamp) > 1e19:
-            skipped += 1
-            continue
-        rows.append([stamp, *(_value(cells[c.index], c) for c in columns)])
-        last = stamp
-    return rows, skipped
+        if abs(stamp + turns) <= 1e19:
+            last = stamp + turns
+            stamps.append(last)
+            timed.append(cells)
+    keep = longest_increasing(np.array(stamps)).tolist()
+    rows = [[stamps[i], *(_value(timed[i][c.index], c) for c in columns)] for i in keep]
+    return rows, len(lines) - len(rows)
 
 
 def _value(text: str, column: _Column) -> float:
@@ -284,6 +275,19 @@ def detect_units(table: TelemetryTable) -> TelemetryUnits:
     return replace(
         units, velocity_m_s=0.1, evidence=f"the unit of its header line, z {'down' if units.z_down else 'up'}"
     )
+
+
+def _assumed_units(table: TelemetryTable, units: TelemetryUnits, name: str) -> list[str]:
+    """A warning if the SDK's units are assumed of numbers that its drones, which count in whole ones, do not send."""
+    known = {*table.stated, *(_VELOCITY if units.velocity_m_s != TelemetryUnits().velocity_m_s else ())}
+    whole = {key: bool(np.all(np.nan_to_num(table.values[key]) % 1.0 == 0.0)) for key in table.values}
+    doubtful = [key for key in (*_VELOCITY, *_ATTITUDE, "tof", "h") if not whole.get(key, True) and key not in known]
+    if not doubtful:
+        return []
+    return [
+        f"{name}: no unit of {', '.join(doubtful)} is stated: taken for dm/s, degrees and cm; write others in the "
+        "header line, such as 'vgx (m/s)'"
+    ]
 
 
 def _turned_to_world(values: dict[str, FloatArray]) -> dict[str, FloatArray]:

@@ -32,6 +32,16 @@ from edgeslam_torch.writers.occupancy import (
 from edgeslam_torch.writers.ply import write_ply
 
 
+def test_the_map_of_a_run_is_not_replaced_by_a_part_of_it(tmp_path, cloud, capsys):
+    write_ply(tmp_path / "edge_map.ply", cloud)
+    (tmp_path / "trajectory.txt").write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
+    before = (tmp_path / "edge_map.ply").read_bytes()
+    out = str(tmp_path / "edge_map.ply")
+    assert main(["export-map", str(tmp_path), "--format", "ply", "--max-sigma", "0.05", "-o", out, "--overwrite"]) == 1
+    assert "is what the command reads" in capsys.readouterr().err
+    assert (tmp_path / "edge_map.ply").read_bytes() == before
+
+
 @pytest.fixture
 def cloud(rng):
     return PointCloud(

@@ -30,9 +30,31 @@ def _check(parser, *words):
 @pytest.mark.parametrize("name", [*OUTPUTS, "rgb.txt", "groundtruth.txt", "telemetry.csv", "mine.json"])
 def test_no_file_of_a_folder_that_is_read_is_replaced(parser, tmp_path, name):
     (tmp_path / name).touch()
-    free = {"mine.json", "report.html", "map.png", "config.toml", "camera.yaml"}  # not read, or what calibrate makes
+    free = {"mine.json", "report.html", "config.toml"}  # not read
     with nullcontext() if name in free else pytest.raises(OutputError, match="reads"):
         _check(parser, tmp_path, "--json", tmp_path / name, "--overwrite")
+
+
+@pytest.mark.parametrize("name", ["rgb/1.png", "mav0/cam0/data/7.JPG", "flight.mp4", "bag_0.mcap", "bag_0.db3"])
+def test_no_picture_or_bag_within_a_recording_is_replaced(parser, tmp_path, name):
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    with pytest.raises(OutputError, match="reads"):
+        _check(parser, tmp_path, "--json", path, "--overwrite")
+
+
+def test_results_in_the_folder_that_a_command_writes_are_replaced(tmp_path):
+    parser = argparse.ArgumentParser()
+    parser.add_argument("source")
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--save-mcap", type=output_file)
+    parser.add_argument("--camera", type=output_file, default=Path("camera.yaml"))
+    add_overwrite(parser)
+    for name in ("run.mcap", "camera.yaml"):
+        (tmp_path / name).touch()
+    _check(parser, "in", "--out", tmp_path, "--save-mcap", tmp_path / "run.mcap", "--overwrite")
+    _check(parser, tmp_path, "--camera", tmp_path / "camera.yaml", "--overwrite")  # what such a command makes
 
 
 @pytest.mark.parametrize("spelling", ["same", "relative", "symlink", "hard link"])

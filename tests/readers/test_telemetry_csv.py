@@ -94,11 +94,41 @@ def test_a_row_cut_by_a_crash_costs_only_that_row(tmp_path):
 
 
 def test_rows_without_order_or_numbers_are_skipped_and_counted(tmp_path):
-    path = write(tmp_path, "stamp_s,vgx,bat\n1,1,90\n1,2,90\nx,3,90\n0.5,4,90\n2,,90\n3,5\n\n# note\n4,6,90\n")
+    path = write(tmp_path, "stamp_s,vgx,bat\n1,1,90\n1,2,90\nx,3,90\n2,,90\n0.5,4,90\n3,5\n\n# note\n4,6,90\n")
     table = read_table(path)
     np.testing.assert_array_equal(table.stamps_s, [1.0, 2.0, 4.0])
     assert table.skipped == 4
     assert math.isnan(table.values["vgx"][1])
+
+
+@pytest.mark.parametrize("wild", ["99999", "-5", "inf", "1e300"])
+def test_a_wild_stamp_costs_one_row(tmp_path, wild):
+    rows = [f"{wild if i == 3 else i / 10},{i},90\n" for i in range(40)]
+    table = read_table(write(tmp_path, "stamp_s,vgx,bat\n" + "".join(rows)))
+    np.testing.assert_array_equal(table.values["vgx"], [i for i in range(40) if i != 3])
+    assert table.skipped == 1
+
+
+@pytest.mark.parametrize(("clock", "unit_s"), [("time_us", 1e-6), ("stamp_ns", 1e-9), ("t (ms)", 1e-3), ("ts_s", 1.0)])
+def test_any_clock_may_state_its_unit(tmp_path, clock, unit_s):
+    rows = [f"{round(i / 10 / unit_s)},1\n" for i in range(0, 400, 10)]
+    table = read_table(write(tmp_path, f"{clock},vgx\n" + "".join(rows)))
+    np.testing.assert_allclose(table.stamps_s, np.arange(40.0))
+
+
+@pytest.mark.parametrize(
+    ("header", "value", "said"),
+    [
+        ("vgx", 3, False),
+        ("vgx", 0.3, True),
+        ("vgx (m/s)", 0.3, False),
+        ("yaw", 0.05, True),
+        ("yaw_rad", 0.05, False),
+    ],
+)
+def test_numbers_that_no_tello_sends_are_said_to_have_no_unit(tmp_path, header, value, said):
+    path = write(tmp_path, f"stamp_s,{header}\n" + "".join(f"{i / 10},{value}\n" for i in range(40)))
+    assert any("unit" in warning for warning in read_telemetry(path)[1]) is said
 
 
 @pytest.mark.parametrize(

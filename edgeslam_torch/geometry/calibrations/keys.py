@@ -31,7 +31,8 @@ _NAMES = {
     "K": "k k1 camk cameramatrix intrinsics intrinsic intrinsicmatrix cameraintrinsics mtx m1 calibration kmatrix "
     "projectionparameters cameraintrinsicmatrix",
     "D": "d d1 distortion distortioncoeffs distortioncoefficients distortioncoefficient distcoeffs distcoeff dist "
-    "distcoef distcoefs distortioncoefs distortionparameters distortionparams distortionvector lensdistortion coeffs",
+    "distcoef distcoefs kc kd distortioncoefs distortionparameters distortionparams distortionvector lensdistortion "
+    "coeffs",
     "lens": "model cameramodel distortionmodel modeltype type cameratype lens lensmodel lenstype distortiontype "
     "projection projectionmodel distmodel intrinsicsmodel",
     "fisheye": "fisheye isfisheye fisheyemodel",
@@ -76,7 +77,7 @@ _HARMLESS_GROUPS = re.compile(
 """Groups of settings irrelevant to the lens: ORB-SLAM's, stella_vslam's, ROS's."""
 _CALIBRATION_LIKE = re.compile(
     r".*(dist(?!ance)|lens|model|coef|fish|omni|focal|princip|intrin|skew|matrix|mirror|radial|tangent|rational|fov|calib"
-    r"|undist|decimat).*|[kpsfc]\d*[xyuvr]?\d?|xi|alpha|beta|omega|gamma\d?|crop.*|shear"
+    r"|undist|decimat|radtan|brown|plumb|barrel|kappa).*|[kpsfc]\d*[xyuvr]?\d?|xi|alpha|beta|omega|gamma\d?|crop.*|shear"
 )
 
 

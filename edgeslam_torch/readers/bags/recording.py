@@ -5,6 +5,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from edgeslam_torch.readers.bags.imu import read_bag_imu
 from edgeslam_torch.readers.bags.pictures import PictureDecoder
 from edgeslam_torch.readers.bags.telemetry import read_bag_telemetry
 from edgeslam_torch.readers.bags.topics import Choice, choose
-from edgeslam_torch.readers.levels import FIRST, Levels, levels_of
+from edgeslam_torch.readers.levels import Levels, levels_of
 from edgeslam_torch.readers.listing import Problem
 from edgeslam_torch.types import Frame, TelemetrySample
 
@@ -131,23 +132,31 @@ def _first_look(bag: Bag, name: str) -> tuple[tuple[int, int], Levels | None]:
     Raises:
         SourceError: If none can be read.
     """
-    decoder, first = PictureDecoder(f"{bag.path.name}:{name}"), ""
+    decoder = PictureDecoder(f"{bag.path.name}:{name}")
     sizes: list[tuple[int, int]] = []
-    deep: list[NDArray[Any]] = []
-    for raw, _ in zip(bag.messages([name]), range(_LOOKED_AT), strict=False):
-        try:
-            message = bag.decode(raw)
-            picture, _code = decoder.pixels(message)
-            height, width = decoder.decode(message).shape[:2]
-        except SourceError as error:
-            first = first or str(error)
-            continue
-        sizes.append((width, height))
-        if picture.dtype != np.uint8 and len(deep) < FIRST:
-            deep.append(picture)
+    faults: list[str] = []
+
+    def deep() -> Iterator[NDArray[Any]]:
+        for raw in islice(bag.messages([name]), _LOOKED_AT):
+            try:
+                message = bag.decode(raw)
+                picture, _code = decoder.pixels(message)
+                height, width = decoder.decode(message).shape[:2]
+            except SourceError as error:
+                faults.append(str(error))
+                continue
+            sizes.append((width, height))
+            if picture.dtype != np.uint8:
+                yield picture
+
+    pictures = deep()
+    first = next(pictures, None)
+    levels = None if first is None else levels_of(chain([first], pictures))
+    for _ in pictures:  # the sizes of the others
+        pass
     if not sizes:
-        raise SourceError(first or f"{bag.path}: {name} holds no message")
-    return Counter(sizes).most_common(1)[0][0], levels_of(deep) if deep else None
+        raise SourceError(faults[0] if faults else f"{bag.path}: {name} holds no message")
+    return Counter(sizes).most_common(1)[0][0], levels
 
 
 def _clocks(bag: Bag, choice: Choice, remarks: list[str]) -> tuple[Offset, dict[str, TopicClock]]:

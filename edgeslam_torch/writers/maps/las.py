@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from edgeslam_torch.extras import needs_extra
+from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.types import PointCloud
 
 _STEP_M = 1e-4
@@ -12,8 +13,8 @@ _STEP_M = 1e-4
 
 
 def write_las(path: Path, cloud: PointCloud, comment: str = "") -> None:
-    """Write a cloud with colour, and ``sigma`` and ``observations`` as extra dimensions, and a comment as the text
-    area description.
+    """Write a cloud, atomically, with colour, ``sigma`` and ``observations`` as extra dimensions, and a comment as the
+    text area description.
 
     Raises:
         MissingPackageError: If laspy is not installed.
@@ -31,4 +32,4 @@ def write_las(path: Path, cloud: PointCloud, comment: str = "") -> None:
     file.xyz = cloud.p_w.astype(np.float64)
     file.red, file.green, file.blue = (cloud.colour.astype(np.uint16) * 257).T
     file.sigma, file.observations = cloud.sigma_m, cloud.observations
-    file.write(str(path))
+    write_atomically(path, lambda target: file.write(target, do_compress=path.suffix.lower() == ".laz"))
