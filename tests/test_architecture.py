@@ -64,11 +64,8 @@ LINKED = ("models", "losses", "train", "eval")
 MAY_USE = {part: row.may_use | set(LAYERS[0].parts) for row in LAYERS for part in row.parts}
 """Everybody may use the first row."""
 
-NEVER = {"evo", "djitellopy", "open3d", "torchvision", "pypose"}
+NEVER = {"evo", "gtsam", "djitellopy", "open3d", "torchvision", "pypose"}
 """GPL, or measured and found wanting (docs/decisions/27-dependencies.md); tests may use some as outside oracles."""
-
-ORACLES = {"gtsam": "edgeslam_torch.eval.benchmark.windows"}
-"""Packages that one module may compare with when they happen to be installed."""
 
 HEAVY = (
     "torch",
@@ -196,9 +193,8 @@ def test_no_folder_is_too_big():
 
 def test_packages_that_do_not_belong_are_not_imported():
     tops = {module: {name.split(".")[0] for name in names} for module, names in imports().items()}
-    users = {name: {module for module, found in tops.items() if name in found} for name in {*NEVER, *ORACLES, *LINKED}}
+    users = {name: {module for module, found in tops.items() if name in found} for name in {*NEVER, *LINKED}}
     assert {name: users[name] for name in NEVER if users[name]} == {}
-    assert {name: users[name] - {home} for name, home in ORACLES.items() if users[name] - {home}} == {}
     assert {name: users[name] for name in LINKED if users[name]} == {}, "import edgeslam_torch.losses, not losses"
 
 

@@ -1,20 +1,16 @@
 """The benchmark's runs with one change at a time: the ablation's rows, and depth networks beside each other."""
 
 import json
-import time
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edgeslam_torch import __version__
-from edgeslam_torch.eval.benchmark.benchmark import BenchSettings, run_rows
-from edgeslam_torch.eval.benchmark.compare import compare
+from edgeslam_torch.eval.benchmark.benchmark import FIGURES, BenchSettings, asked, conditions, run_rows, sequences
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.experiment.conditions import machine
-from edgeslam_torch.eval.experiment.figures import Figure
-from edgeslam_torch.eval.report.tables import markdown_table
+from edgeslam_torch.eval.experiment.figures import Figure, changes, grouped
+from edgeslam_torch.eval.experiment.tables import markdown_table
 from edgeslam_torch.files.atomic import write_text
 
 DEFAULT = "default"
@@ -40,27 +36,11 @@ ROWS = {
 }
 """The table of `edgeslam ablation` by name, top to bottom."""
 
-COLUMNS = (
-    Figure("ate_sim3_m", "ATE [mm]", "{:.1f}", 1e3),
-    Figure("ate_online_sim3_m", "online [mm]", "{:.1f}", 1e3),
-    Figure("map_median_m", "map error [mm]", "{:.1f}", 1e3),
-    Figure("edges_within_2cm", "edges in 2 cm", "{:.0f} %", 1e2),
-    Figure("map_points", "points", "{:.0f}"),
-    Figure("supported", "supported", "{:.0f} %", 1e2),
-    Figure("scale_error_abs", "scale off", "{:.1f} %", 1e2),
-    Figure("cpu_ms_per_frame", "CPU [ms/frame]", "{:.0f}"),
-    Figure("finish_ms", "last refinement [ms]", "{:.0f}"),
-)
 _JUDGED = ("ate_sim3_m", "ate_online_sim3_m", "map_median_m", "edges_within_2cm", "map_points")
-_NETWORKS = (
-    Figure("ate_sim3_m", "ATE Sim(3) [m]"),
-    Figure("coverage", "frames with a pose", "{:.1%}"),
-    Figure("map_points", "map points", "{:.0f}"),
-    Figure("map_median_m", "map, median [m]"),
-    Figure("scale_error_abs", "scale off", "{:.1%}"),
-    Figure("cpu_ms_per_frame", "CPU [ms/frame]", "{:.1f}"),
-    Figure("depth", "depth [ms/frame]", "{:.1f}"),
-)
+_SHOWN = (*_JUDGED, "coverage", "scale_error_abs", "cpu_ms_per_frame")
+JUDGED, COLUMNS = (tuple(f for f in FIGURES if f.name in names) for names in (_JUDGED, _SHOWN))
+COLUMNS = (*COLUMNS, Figure("finish_ms", "last refinement [ms]", "{:.0f}"))
+_NETWORKS = tuple(f for f in FIGURES if f.name in _SHOWN and f.name not in ("ate_online_sim3_m", "edges_within_2cm"))
 
 
 def run_ablation(
@@ -86,37 +66,19 @@ def run_ablation(
     wanted = set(names or ROWS)
     wanted |= {ROWS[name].against for name in wanted} | {DEFAULT}
     rows = {name: (row.set, row.first) for name, row in ROWS.items() if name in wanted}
-    records = run_rows(settings, rows, out, say)
-    record = {
-        "version": __version__,
-        "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "machine": machine(),
-        "settings": {
-            "seeds": list(settings.seeds),
-            "max_frames": settings.max_frames,
-            "overrides": list(settings.overrides),
-        },
-        "rows": {
-            name: {"runs": [_kept(run) for run in records[name]["runs"]] if name in records else []} for name in ROWS
-        },
-    }
+    found = run_rows(settings, sequences(settings), rows, out, say)
+    kept = {name: {"runs": found.get(name, [])} for name in ROWS}
+    record = conditions() | {"settings": asked(settings), "rows": kept}
     write_text(out / "ablation.json", json.dumps(record, indent=1) + "\n")
     return record
-
-
-def _kept(run: dict[str, Any]) -> dict[str, Any]:
-    """What the record has of a run."""
-    figures = {c.name: run["figures"].get("coverage" if c.name == "supported" else c.name) for c in COLUMNS}
-    return {"sequence": run["sequence"], "seed": run["seed"], "figures": figures, "error": run["error"]}
 
 
 def markdown_ablation(record: dict[str, Any]) -> str:
     """One table a sequence: medians over the seeds, and whether a row differs from the one it is compared with.
 
-    "worse" and "better" are the row's, beyond twice the seeds' scatter and the benchmark's floor (`compare`);
-    what is not named is the same.
+    "worse" and "better" are the row's, beyond the noise (`experiment.figures`); what is not named is the same.
     """
-    records = {name: row for name, row in record["rows"].items() if row["runs"]}
+    rows = {name: grouped(row["runs"], "sequence") for name, row in record["rows"].items() if row["runs"]}
     settings = record["settings"]
     frames = "all frames" if settings["max_frames"] is None else f"first {settings['max_frames']} frames"
     parts = [
@@ -124,24 +86,22 @@ def markdown_ablation(record: dict[str, Any]) -> str:
         f"{' '.join(str(s) for s in settings['seeds'])}, medians; {record['machine']['cores']} x "
         f"{record['machine']['cpu']}"
     ]
-    for sequence in dict.fromkeys(run["sequence"] for row in records.values() for run in row["runs"]):
+    for sequence in rows[DEFAULT]:
         lines = []
-        for name, row in records.items():
-            runs = [run for run in row["runs"] if run["sequence"] == sequence]
-            none = "failed" if any(run["error"] for run in runs) else "-"
-            cells = [c.cell([run["figures"].get(c.name) for run in runs], none) for c in COLUMNS]
-            lines.append([ROWS[name].title, *cells, _verdict(records, name, sequence)])
+        for name, groups in rows.items():
+            none = "failed" if any(run["error"] for run in groups[sequence]) else "-"
+            cells = [c.cell(c.values(groups[sequence]), none) for c in COLUMNS]
+            against = ROWS[name].against
+            beside = "" if name == against else f"{against}: {_verdict(rows[against], groups, sequence)}"
+            lines.append([ROWS[name].title, *cells, beside])
         parts += ["", f"### {sequence}", "", markdown_table(["", *(c.title for c in COLUMNS), "beside"], lines)]
     return "\n".join(parts) + "\n"
 
 
-def _verdict(records: dict[str, dict[str, Any]], name: str, sequence: str) -> str:
-    against = ROWS[name].against
-    if name == against or against not in records:
-        return ""
-    found = [c for c in compare(records[against], records[name]) if c["sequence"] == sequence]
-    told = [f"{c['title'].split(' [')[0]} {c['verdict']}" for c in found if c["metric"] in _JUDGED]
-    return f"{against}: {', '.join(text for text in told if not text.endswith(' same')) or 'same'}"
+def _verdict(before: dict[str, Any], after: dict[str, Any], sequence: str) -> str:
+    found = changes({sequence: before[sequence]}, {sequence: after[sequence]}, JUDGED)
+    told = [f"{f.title.split(' [')[0]} {found[sequence, f.name]}" for f in JUDGED if (sequence, f.name) in found]
+    return ", ".join(text for text in told if not text.endswith(" same")) or "same"
 
 
 def compare_networks(
@@ -149,7 +109,8 @@ def compare_networks(
 ) -> dict[str, dict[str, Any]]:
     """The runs once with every depth network: a record of each, by the network's name as ``depth.weights`` takes it."""
     rows = {str(number): ((f"depth.weights={network}",), "") for number, network in enumerate(networks)}
-    return dict(zip(networks, run_rows(settings, rows, out, say, min_hz=15.0).values(), strict=True))
+    found = run_rows(settings, sequences(settings), rows, out, say)
+    return {network: {"runs": runs} for network, runs in zip(networks, found.values(), strict=True)}
 
 
 def markdown_networks(records: dict[str, dict[str, Any]]) -> str:
@@ -158,8 +119,8 @@ def markdown_networks(records: dict[str, dict[str, Any]]) -> str:
     lines = []
     for network, record in records.items():
         for run in record["runs"]:
-            figures = {**run["figures"], "depth": run["stages"].get("depth")}
-            cells = [c.cell([figures.get(c.name)]) for c in _NETWORKS]
+            depth_ms = run["stages"].get("depth")
+            cells = [*(f.cell(f.values([run])) for f in _NETWORKS), "-" if depth_ms is None else f"{depth_ms:.1f}"]
             cells = [f"failed: {run['error']}", *[""] * (len(cells) - 1)] if run["error"] else cells
             lines.append([Path(network).name, f"{run['sequence']}, seed {run['seed']}", *cells])
-    return markdown_table(["network", "sequence", *(c.title for c in _NETWORKS)], lines) + "\n"
+    return markdown_table(["network", "sequence", *(f.title for f in _NETWORKS), "depth [ms/frame]"], lines) + "\n"

@@ -1,16 +1,23 @@
-"""Conditions of a measurement: the machine and the state of the code."""
+"""Conditions of a measurement: the machine, how fast it is at the moment, and the state of the code."""
 
 import hashlib
 import os
 import platform
+import statistics
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
+
+import cv2
+import numpy as np
 
 from edgeslam_torch import __version__
 
 _CODE = tuple(f":(top){folder}" for folder in ("edgeslam_torch", "models", "losses", "train", "eval"))
 """What figures depend on: documents and tests may change without making them old."""
+
+_PASSES = 15
 
 
 def machine() -> dict[str, Any]:
@@ -26,6 +33,24 @@ def machine() -> dict[str, Any]:
         "system": platform.platform(),
         "python": platform.python_version(),
     }
+
+
+def orb_pass_ms() -> float:
+    """CPU time of one pass of ORB (1000 features) over one 640 x 480 image: the unit that costs are stated in.
+
+    Every system of this kind spends some such passes on a frame, and they take as much longer on a slower processor.
+    Timed right before and after a run, it is also as slow as the machine was then.
+    """
+    cv2.setNumThreads(1)
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640), dtype=np.uint8)
+    image = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
+    orb = cv2.ORB.create(1000)
+    times = []
+    for _ in range(_PASSES):
+        start = time.thread_time()
+        orb.detectAndCompute(image, None)
+        times.append(1e3 * (time.thread_time() - start))
+    return statistics.median(times)
 
 
 def code_state() -> str:

@@ -1,15 +1,26 @@
-"""Figures of runs: how they are printed, and which difference of two sets of runs is more than noise.
+"""Figures of runs, and two sets of runs side by side: which difference of their medians is more than noise.
 
 Two medians differ by chance by ``2 sqrt(s_a^2/n_a + s_b^2/n_b)``, with ``s`` the sample standard deviation over the
 seeds, and never by less than a figure's floor, for what one record cannot see of itself.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-SIGMAS = 2.0
+from edgeslam_torch.eval.experiment.tables import markdown_table
+
+_SIGMAS = 2.0
+_MOST_NAMED = 8
+"""Names of only one of two records that are listed."""
+_CONDITIONS = ("machine", "seeds", "mode", "max_frames", "overrides")
+
+Run = Mapping[str, Any]
+"""A run, with its ``figures`` by name; None where it has none."""
+Groups = Mapping[str, Sequence[Run]]
+"""Runs of one source with several seeds, by the source's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +42,6 @@ class Figure:
     relative: bool = True
     """Whether the floors are shares of the first median."""
     lower_is_better: bool = True
-    clock: str = ""
-    """Which time of the reference work it follows (`machine_speed.reference`); empty when it is no time."""
 
     def cell(self, values: Sequence[float | None], none: str = "-") -> str:
         """Median of several runs' values."""
@@ -44,35 +53,81 @@ class Figure:
             text += f" [{self.text.format(known.min())} {self.text.format(known.max())}]"
         return text
 
+    def values(self, runs: Sequence[Run]) -> list[float]:
+        """Of the runs that have it."""
+        found = [run["figures"].get(self.name) for run in runs]
+        return [float(v) for v in found if v is not None and np.isfinite(v)]
 
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """Two sets of runs, by their medians."""
+    def noise(self, before: Sequence[float], after: Sequence[float]) -> float:
+        """Difference of the medians of two sets of values that means nothing."""
+        by_chance = _SIGMAS * float(np.sqrt(sum(_scatter(values) ** 2 / len(values) for values in (before, after))))
+        floor = self.one_seed if self.one_seed is not None and min(len(before), len(after)) == 1 else self.floor
+        return max(by_chance, (floor or 0.0) * (abs(float(np.median(before))) if self.relative else 1.0))
 
-    before: float
-    after: float
-    noise: float
-    """Difference that means nothing."""
-    verdict: str
-    """``better``, ``worse`` or ``same``."""
+    def verdict(self, before: Sequence[float], after: Sequence[float]) -> str:
+        """``better``, ``worse`` or ``same``."""
+        change = float(np.median(after) - np.median(before))
+        if abs(change) <= self.noise(before, after):
+            return "same"
+        return "better" if (change < 0) == self.lower_is_better else "worse"
 
 
-def scatter(values: Sequence[float]) -> float:
+def _scatter(values: Sequence[float]) -> float:
     """Sample standard deviation; 0 of a single value."""
     return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
 
 
-def chance(sides: Sequence[Sequence[float]], scatters: Sequence[float] | None = None, sigmas: float = SIGMAS) -> float:
-    """Difference of two medians by chance; ``scatters`` are the values' own standard deviations unless given."""
-    scatters = [scatter(values) for values in sides] if scatters is None else scatters
-    return sigmas * float(np.sqrt(sum(s**2 / len(values) for s, values in zip(scatters, sides, strict=True))))
+def grouped(runs: Sequence[Run], key: str) -> dict[str, list[Run]]:
+    """Runs by one of their fields, in the order in which they appear."""
+    return {name: [run for run in runs if run[key] == name] for name in dict.fromkeys(run[key] for run in runs)}
 
 
-def difference(figure: Figure, before: Sequence[float], after: Sequence[float], by_chance: float) -> Difference:
-    """Compare two sets of values, which differ by chance by ``by_chance``."""
-    first, second = float(np.median(before)), float(np.median(after))
-    floor = figure.one_seed if figure.one_seed is not None and min(len(before), len(after)) == 1 else figure.floor
-    noise = max(by_chance, (floor or 0.0) * (abs(first) if figure.relative else 1.0))
-    change = second - first
-    better = (change < 0) == figure.lower_is_better
-    return Difference(first, second, noise, "same" if abs(change) <= noise else "better" if better else "worse")
+def changes(before: Groups, after: Groups, figures: Sequence[Figure]) -> dict[tuple[str, str], str]:
+    """Verdict on every compared figure of every name that both have, by name and the figure's name."""
+    found = {}
+    for name in (n for n in after if n in before):
+        for figure in (f for f in figures if f.floor is not None):
+            a, b = figure.values(before[name]), figure.values(after[name])
+            if a:  # what there is no more is worse
+                found[name, figure.name] = figure.verdict(a, b) if b else "worse"
+    return found
+
+
+def markdown_comparison(before: Groups, after: Groups, figures: Sequence[Figure]) -> str:
+    """Medians of both and their ratio, a line for every name, ``!`` where it got worse and ``+`` where better."""
+    found, compared = changes(before, after, figures), [figure for figure in figures if figure.floor is not None]
+    names = [name for name in after if name in before]
+    worse = []
+    lines = []
+    for name in names:
+        line = [name]
+        for figure in compared:
+            a, b = figure.values(before[name]), figure.values(after[name])
+            first, second = (float(np.median(values)) if values else 0.0 for values in (a, b))
+            ratio = f" x{second / first:.2f}" if figure.relative and b and first > 0 else ""
+            verdict = found.get((name, figure.name), "")
+            mark = {"worse": " !", "better": " +"}.get(verdict, "")
+            line.append(f"{figure.cell(a)} -> {figure.cell(b)}{ratio}{mark}" if a or b else "-")
+            if verdict == "worse":
+                worse.append(f"{name} {figure.title}{ratio if b else ' (none any more)'}")
+        lines.append(line)
+    text = [markdown_table(["runs of", *(figure.title for figure in compared)], lines), ""]
+    missing = sorted(before.keys() ^ after.keys())
+    named = ", ".join(missing) if len(missing) <= _MOST_NAMED else f"{len(missing)} names"
+    text += [f"only in one of the two: {named}"] if missing else []
+    text += [f"worse: {', '.join(worse) if worse else 'nothing'}"]
+    if any(len(runs) == 1 for name in names for runs in (before[name], after[name])):
+        text += ["with one seed the scatter is not known: only the floors of the figures are applied"]
+    return "\n".join(text) + "\n"
+
+
+def other_conditions(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
+    """What two records differ in beside their runs, one line each."""
+    lines = []
+    for key in (key for key in _CONDITIONS if key in before and key in after):
+        a, b = before[key], after[key]
+        if isinstance(a, dict) and isinstance(b, dict):
+            lines += [f"beware: {k} was {a[k]}, then {b.get(k)}" for k in a if a[k] != b.get(k)]
+        elif a != b:
+            lines.append(f"beware: {key} was {a}, then {b}")
+    return lines

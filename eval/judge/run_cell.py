@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.eval.benchmark.machine_speed import orb_pass_ms
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.experiment.conditions import orb_pass_ms
 from edgeslam_torch.eval.inputs.dataset import interpolate, open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.eval.judge import flights, second_flight, sources

@@ -3,11 +3,9 @@
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
-from edgeslam_torch.eval.experiment.figures import Difference, Figure, chance, difference
+from edgeslam_torch.eval.experiment.figures import Figure, grouped, markdown_comparison, other_conditions
+from edgeslam_torch.eval.experiment.tables import markdown_table
 from edgeslam_torch.eval.judge.thresholds import Row, Threshold, verdicts_of_cell, verdicts_of_groups
-from edgeslam_torch.eval.report.tables import aligned
 
 _FOOTNOTES = (
     "end, live: share of the frames whose pose rests on the map, at the end and when they came. path: ATE in % of the "
@@ -23,8 +21,6 @@ _FOOTNOTES = (
     "same in passes of ORB over one 640 x 480 image, timed before and after the run. Variants also decode the frames "
     "that they leave out.",
 )
-_MAX_NAMED = 8
-"""Maximum number of cells of only one record that are named."""
 
 COLUMNS = (
     Figure("frames", "frames", "{:.0f}"),
@@ -62,62 +58,29 @@ COLUMNS = (
 )
 """Floors for one seed are two standard deviations of a difference of two runs, measured with three seeds on two
 recordings (tum_fr1_xyz, 7scenes_redkitchen); recordings with tracking losses scatter more."""
-COMPARED = tuple(figure for figure in COLUMNS if figure.floor is not None)
 
 
 def markdown(record: dict[str, Any], thresholds: Sequence[Threshold]) -> str:
     """Medians and thresholds, what passed, footnotes, and every run when there are several a cell."""
     rows = record["rows"]
-    names = _names(record)
+    cells = grouped(rows, "cell")
     header = ["cell", *(c.title for c in COLUMNS), "thresholds"]
-    lines = [[name, *_cells(_rows(record, name)), _passed(name, rows, thresholds)] for name in names]
-    parts = [_conditions(record), "", aligned(header, lines), "", *_outcome(lines, rows, thresholds)]
+    lines = [[name, *_cells(own), _passed(name, rows, thresholds)] for name, own in cells.items()]
+    parts = [_conditions(record), "", markdown_table(header, lines), "", *_outcome(lines, rows, thresholds)]
     notes = [f"- {_run_name(row)}: {note}" for row in rows for note in row["notes"]]
     parts += ["", *notes] if notes else []
     parts += ["", *_FOOTNOTES]
-    if len(rows) > len(names):
-        parts += ["", "Every run:", "", aligned(header[:-1], [[_run_name(row), *_cells([row])] for row in rows])]
+    if len(rows) > len(cells):
+        parts += ["", "Every run:", "", markdown_table(header[:-1], [[_run_name(row), *_cells([row])] for row in rows])]
     return "\n".join(parts) + "\n"
 
 
 def markdown_against(before: dict[str, Any], after: dict[str, Any]) -> str:
-    """Both records' medians and their ratio, cell by cell, ``!`` where it got worse and ``+`` where better."""
-    names = [n for n in _names(after) if n in _names(before)]
-    worse: list[str] = []
-    lines = [[name, *(_side_by_side(name, c, before, after, worse) for c in COMPARED)] for name in names]
-    parts = [f"{before['commit']} -> {after['commit']}, medians, ratio; ! worse, + better by more than the noise"]
-    parts += ["", aligned(["cell", *(c.title for c in COMPARED)], lines), ""]
-    missing = sorted(set(_names(before)) ^ set(_names(after)))
-    named = ", ".join(missing) if len(missing) <= _MAX_NAMED else f"{len(missing)} cells"
-    parts += [f"only in one of the two: {named}"] if missing else []
-    parts += [f"worse: {', '.join(worse) if worse else 'nothing'}"]
-    if any(len(_rows(record, name)) == 1 for record in (before, after) for name in names):
-        parts += [
-            "cells with one seed: noise as measured on two recordings; CPU time also depends on the machine's load"
-        ]
-    return "\n".join(parts) + "\n"
-
-
-def compared(figure: Figure, before: Sequence[float], after: Sequence[float]) -> Difference:
-    """Two cells' values of a figure."""
-    return difference(figure, before, after, chance((before, after)))
-
-
-def _side_by_side(name: str, figure: Figure, before: dict[str, Any], after: dict[str, Any], worse: list[str]) -> str:
-    a, b = (_values(_rows(record, name), figure) for record in (before, after))
-    if not a and not b:
-        return "-"
-    text = f"{figure.cell(a)} -> {figure.cell(b)}"
-    if not b:
-        worse.append(f"{name} {figure.title} (none any more)")
-        return f"{text} !"
-    if not a:
-        return text
-    found = compared(figure, a, b)
-    ratio = f" x{found.after / found.before:.2f}" if figure.relative and found.before > 0 else ""
-    if found.verdict == "worse":
-        worse.append(f"{name} {figure.title}{ratio}")
-    return f"{text}{ratio}{ {'worse': ' !', 'better': ' +', 'same': ''}[found.verdict] }"
+    """Both records' medians and their ratio, cell by cell."""
+    head = f"{before['commit']} -> {after['commit']}, medians, ratio; ! worse, + better by more than the noise"
+    sides = (grouped(record["rows"], "cell") for record in (before, after))
+    beware = other_conditions(before, after)
+    return "\n".join([head, *beware, "", markdown_comparison(*sides, COLUMNS)])
 
 
 def _conditions(record: dict[str, Any]) -> str:
@@ -154,20 +117,8 @@ def _outcome(lines: Sequence[Sequence[str]], rows: Sequence[Row], thresholds: Se
 
 
 def _cells(rows: Sequence[Row]) -> list[str]:
-    return [figure.cell(_values(rows, figure)) for figure in COLUMNS]
+    return [figure.cell(figure.values(rows)) for figure in COLUMNS]
 
 
 def _run_name(row: Row) -> str:
     return f"{row['cell']} seed {row['seed']}"
-
-
-def _names(record: dict[str, Any]) -> list[str]:
-    return list(dict.fromkeys(row["cell"] for row in record["rows"]))
-
-
-def _rows(record: dict[str, Any], name: str) -> list[Row]:
-    return [row for row in record["rows"] if row["cell"] == name]
-
-
-def _values(rows: Sequence[Row], figure: Figure) -> list[float]:
-    return [float(v) for row in rows if (v := row["figures"].get(figure.name)) is not None and np.isfinite(v)]

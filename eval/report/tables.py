@@ -1,12 +1,12 @@
 """Scores as tables, aligned text for a terminal or Markdown: every run on its own line."""
 
-import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from edgeslam_torch.eval.experiment.figures import Figure
+from edgeslam_torch.eval.experiment.tables import markdown_table, text_table
 from edgeslam_torch.eval.metrics.common_frames import CommonScore
 from edgeslam_torch.eval.metrics.depth_error import DepthReport
 from edgeslam_torch.eval.metrics.edge_map_score import THRESHOLDS_M
@@ -47,52 +47,6 @@ def _value(score: RunScore, column: Figure) -> float:
     found = getattr(score, name, None) if column in TRAJECTORY_COLUMNS else getattr(score.map, name, None)
     found = found.get(float(threshold)) if threshold and found is not None else found
     return float("nan") if found is None else float(found)
-
-
-def text_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Aligned columns, the first to the left, titles above them in as many lines as their words need.
-
-    Example:
-        >>> print(text_table(["run", "ATE [m]"], [["a", "0.0100"], ["other", "0.2"]]))
-                  ATE
-        run       [m]
-        a      0.0100
-        other     0.2
-    """
-    cells = list(zip(*rows, strict=True))
-    widths = [
-        max(max(map(len, words), default=0), *(len(word) for word in ([title] if i == 0 else title.split())))
-        for i, (title, words) in enumerate(zip(titles, cells, strict=True))
-    ]
-    heads = [[title] if i == 0 else textwrap.wrap(title, widths[i]) for i, title in enumerate(titles)]
-    height = max(map(len, heads))
-    above = zip(*([""] * (height - len(head)) + head for head in heads), strict=True)
-    lines = [
-        "  ".join(
-            [line[0].ljust(widths[0]), *(word.rjust(width) for word, width in zip(line[1:], widths[1:], strict=True))]
-        )
-        for line in (*above, *rows)
-    ]
-    return "\n".join(line.rstrip() for line in lines)
-
-
-def markdown_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """The same as Markdown."""
-    lines = ["| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
-
-
-def aligned(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """The same with columns padded to one width, numbers to the right, the first and the last column to the left."""
-    ends = (0, len(titles) - 1)
-    widths = [max(3, *(len(line[k]) for line in (titles, *rows))) for k in range(len(titles))]
-
-    def text(line: Sequence[str]) -> str:
-        cells = (c.ljust(w) if k in ends else c.rjust(w) for k, (c, w) in enumerate(zip(line, widths, strict=True)))
-        return "| " + " | ".join(cells) + " |"
-
-    rule = "|" + "|".join("-" * (w + 1) + ("-" if k in ends else ":") for k, w in enumerate(widths)) + "|"
-    return "\n".join([text(titles), rule, *map(text, rows)])
 
 
 def report(scores: Sequence[RunScore], markdown: bool = False) -> str:

@@ -134,7 +134,7 @@ def test_one_command_fetches_runs_and_judges_what_readme_quotes(publisher, data_
     sets = catalogue.read_catalogue()[1]
     recordings = publish(publisher, data_dir, FRAMES)
     monkeypatch.setattr(catalogue, "catalogue", lambda: (recordings, sets))
-    words = ["--seeds", "1", "--no-micro", "--data", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]
+    words = ["--seeds", "1", "--data", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]
     assert main(["bench", "--get", "readme", "--agree", *words]) == 0
     said = capsys.readouterr().out
     record = json.loads((tmp_path / "out" / "bench.json").read_text())

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from seeded_window import Noise, WindowSize, seeded_window
 
-from edgeslam_torch.eval.benchmark.windows import Noise, WindowSize, seeded_window
 from edgeslam_torch.geometry.robust_statistics import robust_sigma
 from edgeslam_torch.optim.adaptive import SCALES, term_residuals, term_sigmas, with_scales
 from edgeslam_torch.optim.local_ba import refine_window

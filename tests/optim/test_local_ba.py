@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from edgeslam_torch.eval.benchmark.windows import (
+from seeded_window import (
     K,
     Noise,
     SeededWindow,
@@ -15,6 +14,7 @@ from edgeslam_torch.eval.benchmark.windows import (
     refine_with_gtsam,
     seeded_window,
 )
+
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import (

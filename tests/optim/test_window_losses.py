@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from seeded_window import Noise, WindowSize, seeded_window
 
-from edgeslam_torch.eval.benchmark.windows import Noise, WindowSize, seeded_window
 from edgeslam_torch.losses import AngleLoss, CycleLoss, EdgeAlignmentLoss, ReprojectionLoss
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.optim.adaptive import window_losses

@@ -60,7 +60,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "time",
     )
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="of those flights at a time (default: 1)")
-    parser.add_argument("--no-micro", action="store_true", help="omit the times of solver and depth network")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the runs (default: runs/bench-TIME)")
     parser.add_argument("--json", type=output_file, metavar="FILE", help="also write the results here")
     parser.add_argument("--markdown", type=output_file, metavar="FILE", help="also write the tables here")
@@ -71,13 +70,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run or compare; 1 when a run failed."""
-    from edgeslam_torch.eval.benchmark import benchmark, compare, rows
+    from edgeslam_torch.eval.benchmark import benchmark, rows
 
     if args.navigation:
         return _navigation(args)
     if args.compare is not None:
-        before, after = (compare.read_record(path) for path in args.compare)
-        print(compare.markdown_compare(before, after))
+        before, after = (benchmark.read_record(path) for path in args.compare)
+        print(benchmark.markdown_compare(before, after))
         return 0
     data = recordings(args.data)
     if args.get:
@@ -90,7 +89,6 @@ def main(args: argparse.Namespace) -> int:
         max_frames=args.max_frames,
         mode=args.mode,
         overrides=tuple(args.set),
-        micro=not args.no_micro,
     )
     if data is None:
         say("no recordings (--data or EDGESLAM_DATA): the synthetic flight alone")

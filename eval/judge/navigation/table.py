@@ -9,9 +9,9 @@ import numpy as np
 
 from edgeslam_torch.eval.experiment.conditions import code_state
 from edgeslam_torch.eval.experiment.runner import Local, Task, run_tasks
+from edgeslam_torch.eval.experiment.tables import markdown_table
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.eval.judge.navigation.pictures import film_strip, top_view
-from edgeslam_torch.eval.report.tables import markdown_table
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.plain import write_image
 from edgeslam_torch.jobs.watched import Limits

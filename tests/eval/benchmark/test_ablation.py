@@ -24,11 +24,11 @@ def runs(monkeypatch, tmp_path):
     """Cases without runs: every figure follows from the settings."""
     made = []
 
-    def run_tasks(tasks, runner, resume):
+    def run_tasks(tasks, runner):
         for case, task in tasks.items():
             made.append(dict(task.case))
             words = " ".join(task.case["arguments"])
-            ate = 0.010 + 0.005 * ("alignment=false" in words) + 0.02 * ("weights=none" in words) + 0.0001 * case[1]
+            ate = 0.010 + 0.005 * ("alignment=false" in words) + 0.02 * ("weights=none" in words) + 0.0002 * case[1]
             figures = {"ate_sim3_m": ate, "map_median_m": 0.02, "finish_ms": 500.0, "coverage": 1.0, "fps": 9.0}
             yield case, {"key": "k", "figures": figures | {"map_points": 5.0}, "stages": {"depth": 3.0}}, None
 
@@ -48,18 +48,21 @@ def test_every_row_is_run_with_its_settings_beside_those_it_is_compared_with(run
     words = [run["arguments"][-1] for run in runs[::3]]
     assert words == ["seed=3"] * 2 and "window.collinearity=relative" in runs[2]["arguments"]
     assert record == json.loads((tmp_path / "ablation.json").read_text())
-    assert "fps" not in record["rows"]["default"]["runs"][0]["figures"]
 
 
 def test_table_names_what_got_worse_and_leaves_the_rest_alone(runs, tmp_path):
     text = markdown_ablation(ablation(tmp_path, seeds=(0, 1), max_frames=300))
     assert "first 300 frames, seeds 0 1" in text
-    lines = {line.split("|")[1].strip(): line for line in text.splitlines() if line.startswith("| ")}
-    assert "| 10.1 | - | 20.0 | - | 5 | 100 % | - | - | 500 |  |" in lines["default"]
-    assert "default: ATE Sim(3) worse" in lines["no edge alignment"]
-    assert "default: ATE Sim(3) worse" in lines["no depth network"]
-    assert "default: same" in lines["no cycle loss"]
-    assert "corners: same" in lines["literal angle (eqs. 24-25)"]
+    lines = {
+        line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:-1]]
+        for line in text.splitlines()
+        if "|" in line
+    }
+    assert lines["default"][:2] == ["0.0101", "-"] and lines["default"][-1] == ""
+    assert lines["no edge alignment"][-1] == "default: ATE Sim(3) worse"
+    assert lines["no depth network"][-1] == "default: ATE Sim(3) worse"
+    assert lines["no cycle loss"][-1] == "default: same"
+    assert lines["literal angle (eqs. 24-25)"][-1] == "corners: same"
 
 
 def test_rows_have_settings_that_exist_and_are_compared_with_rows():
@@ -82,6 +85,9 @@ def test_unknown_names_are_refused(runs, tmp_path, names, only, message):
 
 def test_depth_networks_are_beside_each_other(runs, tmp_path):
     records = compare_networks(BenchSettings(tmp_path, seeds=(0,)), ["default", "none"], tmp_path, lambda line: None)
-    lines = markdown_networks(records).splitlines()
-    assert lines[2].startswith("| default | kitchen, seed 0 | 0.0100 | 100.0% | 5 |") and lines[2].endswith("| 3.0 |")
-    assert lines[3].startswith("| none | kitchen, seed 0 | 0.0300 |")
+    lines = [[c.strip() for c in line.split("|")[1:-1]] for line in markdown_networks(records).splitlines()[2:]]
+    assert [line[:4] for line in lines] == [
+        ["default", "kitchen, seed 0", "0.0100", "-"],
+        ["none", "kitchen, seed 0", "0.0300", "-"],
+    ]
+    assert [line[-1] for line in lines] == ["3.0", "3.0"]

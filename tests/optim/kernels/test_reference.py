@@ -7,8 +7,8 @@ import numpy as np
 import plain_window
 import pytest
 import torch
+from seeded_window import WindowSize, seeded_window
 
-from edgeslam_torch.eval.benchmark.windows import WindowSize, seeded_window
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.optim.blocks import Anchors
 from edgeslam_torch.optim.problem import DepthPriors, LmConfig, WindowProblem

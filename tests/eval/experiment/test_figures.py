@@ -1,0 +1,45 @@
+"""Two sets of runs: what counts as a difference."""
+
+import pytest
+
+from edgeslam_torch.eval.experiment.figures import Figure, changes, grouped, markdown_comparison
+
+ATE = Figure("ate", "ATE", floor=0.03, one_seed=0.10)
+SHARE = Figure("share", "share", floor=0.01, relative=False, lower_is_better=False)
+
+
+def runs(*ates, **figures):
+    return [{"figures": {"ate": ate, **figures}} for ate in ates]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "verdict"),
+    [
+        ((0.0100, 0.0101, 0.0102), (0.0130, 0.0131, 0.0132), "worse"),
+        ((0.0130, 0.0131, 0.0132), (0.0100, 0.0101, 0.0102), "better"),
+        ((1.0, 1.0), (1.02, 1.02), "same"),  # below the floor
+        ((1.0, 1.0), (1.04, 1.04), "worse"),
+        ((1.0,), (1.08,), "same"),  # the floor of a single run
+        ((0.5, 1.0, 1.5), (1.2, 1.7, 2.2), "same"),  # 2 sqrt(2 * 0.25 / 3) = 0.82
+        ((0.9, 1.0, 1.1), (1.2, 1.3, 1.4), "worse"),
+    ],
+)
+def test_difference_of_medians_is_judged_by_scatter_and_floor(before, after, verdict):
+    assert changes({"a": runs(*before)}, {"a": runs(*after)}, [ATE]) == {("a", "ate"): verdict}
+
+
+def test_shares_are_better_when_they_grow_and_what_is_gone_is_worse():
+    before, after = {"a": runs(1.0, share=0.8)}, {"a": runs(None, share=0.9)}
+    assert changes(before, after, [ATE, SHARE]) == {("a", "ate"): "worse", ("a", "share"): "better"}
+
+
+def test_comparison_has_a_line_a_name_and_says_what_is_missing():
+    lines = markdown_comparison({"a": runs(1.0), "b": runs(1.0)}, {"a": runs(2.0), "c": runs(1.0)}, [ATE]).splitlines()
+    assert "1.0000 -> 2.0000 x2.00 !" in lines[2]
+    assert any("b, c" in line for line in lines) and any(line.endswith("a ATE x2.00") for line in lines)
+
+
+def test_runs_are_grouped_in_their_order():
+    found = grouped([{"cell": "b", "k": 0}, {"cell": "a", "k": 1}, {"cell": "b", "k": 2}], "cell")
+    assert {name: [run["k"] for run in group] for name, group in found.items()} == {"b": [0, 2], "a": [1]}
+    assert list(found) == ["b", "a"]
