@@ -24,7 +24,6 @@ from edgeslam_torch.eval.judge.navigation.perception import (
     Perception,
     SlamPerception,
     TruePerception,
-    WatchedPerception,
     nothing_painted,
 )
 from edgeslam_torch.eval.judge.navigation.pictures import shortest_m
@@ -79,10 +78,9 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
         site, TELLO_TILT_RAD, IMAGE_SIZE if by_slam else DEPTH_SIZE, conditions.battery, air, ready=False
     )
     tello = LockstepTello(drone, paint if by_slam else nothing_painted, conditions.radio, case.seed)
-    seeing: Perception = TruePerception(site, drone, conditions)
+    perception: Perception = TruePerception(site, drone, conditions)
     if by_slam:
-        seeing = SlamPerception(camera, conditions, case.seed)
-    perception = WatchedPerception(seeing, site)
+        perception = SlamPerception(camera, conditions, case.seed)
     tasks = _Tasks(site, behaviour, FlightController(limits), conditions.scale)
     found = Flown(case)
     if case.behaviour == "goto":
@@ -90,9 +88,6 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
     _sum_up(found, site, drone, _fly(tello, perception, tasks, conditions, found), behaviour)
     known = tasks.flight_controller.exits()
     found.exits = [len(site.exits), len(known), right_exits(known, site)]
-    found.near = perception.counts.tolist()
-    if perception.depth_age_s:
-        found.depth_age_s = np.round(np.percentile(perception.depth_age_s, [50, 95]), 3).tolist()
     return found
 
 
@@ -130,9 +125,7 @@ class _Tasks:
 
 @dataclass(slots=True)
 class _Tick:
-    clock_s: float
     p_w: FloatArray
-    rpy: FloatArray
     speed_m_s: float
     clearance_m: float
     cpu_s: float
@@ -168,7 +161,7 @@ def _fly(
         order = controller.order(state)
         cpu_s = time.process_time() - began
         speed, clear_m = float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w)
-        ticks.append(_Tick(tello.clock_s, drone.p_w.copy(), drone.rpy(), speed, clear_m, cpu_s))
+        ticks.append(_Tick(drone.p_w.copy(), speed, clear_m, cpu_s))
         if order.danger:
             dangers[str(order.danger)] = None
         landing = tasks.over() or order.land
@@ -204,8 +197,6 @@ def _sum_up(found: Flown, site: Site, drone: DroneModel, ticks: list[_Tick], beh
     hull = np.array([t.clearance_m for t in ticks]) - NavLimits().radius_m
     speed, cpu = np.array([t.speed_m_s for t in ticks]), 1e3 * np.array([t.cpu_s for t in ticks])
     found.track_w = np.round(p, 3).tolist()
-    clock, rpy = np.array([t.clock_s for t in ticks]), np.array([t.rpy for t in ticks])
-    found.attitude = np.round(np.column_stack([clock, rpy, hull]), 3).tolist()
     found.path_m = float(np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1).sum())
     found.distance_m = float(np.linalg.norm(drone.p_w[:2] - site.goal_w[:2]))
     found.home_m = float(np.linalg.norm(drone.p_w[:2]))

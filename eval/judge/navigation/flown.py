@@ -1,6 +1,5 @@
 """Cases of judged flights and their results."""
 
-import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -58,10 +57,6 @@ class Flown:
     cpu_ms: float = 0.0
     """CPU time of planning and mapping per tick."""
     cpu_worst_ms: float = 0.0
-    near: list[int] = field(default_factory=lambda: [0, 0, 0])
-    """Sectors with an obstacle at 0.3 to 1 m; those 0.3 m too far; those even at two sigmas (`near_counts`)."""
-    depth_age_s: list[float] = field(default_factory=lambda: [math.nan, math.nan])
-    """Age of the newest depth when it is planned with: median and 95th percentile."""
     off: list[int] = field(default_factory=lambda: [0, 0])
     """Ticks with metric scale; those of them with an inconsistent pose (`is_beyond`)."""
     off_m: float = 0.0
@@ -69,9 +64,7 @@ class Flown:
     dangers: tuple[str, ...] = ()
     """Dangers handled by the supervisor."""
     track_w: list[list[float]] = field(default_factory=list)
-    """``(N, 3)`` true path, for pictures."""
-    attitude: list[list[float]] = field(default_factory=list)
-    """``(N, 5)`` along it: clock [s]; roll, pitch, yaw [rad]; clearance beyond the hull [m]."""
+    """``(N, 3)`` true path, for a top view."""
 
     def record(self) -> dict[str, Any]:
         """For JSON."""

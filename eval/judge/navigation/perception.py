@@ -1,5 +1,4 @@
-"""Sources of the planner's states in judged flights, with the latency of the video: ground truth, or the SLAM; how far
-off the nearest obstacles of their views are."""
+"""Sources of the planner's states in judged flights, with the latency of the video: ground truth, or the SLAM."""
 
 import math
 from dataclasses import dataclass, field
@@ -16,14 +15,10 @@ from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.synthetic.house.render import depth_map
 from edgeslam_torch.synthetic.sites.site import Site
-from edgeslam_torch.types import FloatArray
 
 DEPTH_SIZE, IMAGE_SIZE = (160, 120), (480, 360)
 """Of true depth, and of the images that the SLAM sees."""
 _SIGMA_LOG = 0.01
-SECTOR_RAD, NEAR_M, TOO_FAR_M = math.radians(3.7), (0.3, 1.0), 0.3
-_SIGMAS = 2.0
-"""As in the occupancy grid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,11 +90,12 @@ class TruePerception:
         )
 
     def _view(self, picture: Picture) -> View:
-        depth, scale = true_depth(self._site, picture, DEPTH_SIZE), self._conditions.scale
+        camera, scale = PRESETS["tello"].scaled(*DEPTH_SIZE), self._conditions.scale
         T_w_c = picture.T_w_b @ camera_on_body()
+        depth = depth_map(self._site.painted(picture.captured_s), camera, self._site.T_site_w @ T_w_c)
         T_w_c[:3, 3] /= scale
         sigma = np.full(depth.shape, _SIGMA_LOG, np.float32)
-        return View(picture.captured_s, depth / scale, sigma, PRESETS["tello"].scaled(*DEPTH_SIZE).K, T_w_c)
+        return View(picture.captured_s, depth / scale, sigma, camera.K, T_w_c)
 
 
 class SlamPerception:
@@ -125,61 +121,3 @@ class SlamPerception:
 def nothing_painted(T_w_b: np.ndarray) -> np.ndarray:
     """An empty image: ground truth perception needs none."""
     return np.zeros((1, 1, 3), np.uint8)
-
-
-def true_depth(site: Site, picture: Picture, size: tuple[int, int]) -> FloatArray:
-    """Exact z-depth ``(H, W)`` [m] of a picture."""
-    T_site_c = site.T_site_w @ picture.T_w_b @ camera_on_body()
-    return depth_map(site.painted(picture.captured_s), PRESETS["tello"].scaled(*size), T_site_c)
-
-
-def near_counts(view: View, true_m: FloatArray) -> np.ndarray:
-    """Accuracy of near depth: the nearest obstacle in each narrow sector of a view against the truth.
-
-    Args:
-        view: Depth with standard deviation; a sector without depth is unknown, hence not free and not too far.
-        true_m: ``(H, W)`` z-depth [m].
-
-    Returns:
-        Number of sectors whose true nearest surface is within `NEAR_M`; of those in which the view's nearest depth is
-        more than `TOO_FAR_M` too far; the same for depth less two standard deviations, as used by the occupancy grid.
-    """
-    known = np.isfinite(view.depth_m) & (view.depth_m > 0)
-    measured = np.where(known, view.depth_m, np.inf)
-    lower = np.where(known, measured * np.exp(-_SIGMAS * view.sigma_log), np.inf)
-    true = np.where(np.isfinite(true_m) & (true_m > 0), true_m, np.inf)
-    angle = np.arctan((np.arange(true.shape[1]) - view.K[0, 2]) / view.K[0, 0])
-    sector = np.floor((angle - angle[0]) / SECTOR_RAD).astype(int)
-    counts = np.zeros(3, dtype=int)
-    for k in range(int(sector[-1]) + 1):
-        nearest, *stated = (float(d[:, sector == k].min()) for d in (true, measured, lower))
-        if NEAR_M[0] <= nearest <= NEAR_M[1]:
-            counts += [1, *(math.isfinite(d) and d - nearest > TOO_FAR_M for d in stated)]
-    return counts
-
-
-class WatchedPerception:
-    """Wraps a perception and records, per metric view, near-depth errors and the age of depth."""
-
-    def __init__(self, perception: Perception, site: Site) -> None:
-        self.counts = np.zeros(3, dtype=int)
-        """Sums of `near_counts`."""
-        self.depth_age_s: list[float] = []
-        """Age of the newest depth at each tick."""
-        self._seen_s = math.nan
-        self._perception, self._site = perception, site
-
-    def state(self, now_s: float, events: list[Event]) -> DroneState:
-        """State of the wrapped perception."""
-        state = self._perception.state(now_s, events)
-        view = state.view
-        if view is not None:
-            self._seen_s = view.stamp_s
-        if math.isfinite(self._seen_s):
-            self.depth_age_s.append(now_s - self._seen_s)
-        if view is not None and state.metric:
-            size = view.depth_m.shape[1], view.depth_m.shape[0]
-            for event in events:
-                if isinstance(event, Picture) and event.captured_s == view.stamp_s:
-                    self.counts += near_counts(view, true_depth(self._site, event, size))
-        return state

@@ -1,17 +1,13 @@
-"""Judged flights in the true world: the shortest path there, top views, and film strips of what the camera saw."""
+"""Judged flights in the true world: the shortest path there, and top views."""
 
 import cv2
 import numpy as np
 
 from edgeslam_torch.eval.judge.navigation.flown import Flown
-from edgeslam_torch.geometry.camera import PRESETS
-from edgeslam_torch.geometry.mount import camera_on_body
-from edgeslam_torch.geometry.rotations import matrix_from_rpy
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.pilot import BAND_M
 from edgeslam_torch.navigation.route import cost_to_go
-from edgeslam_torch.synthetic.house.render import picture
 from edgeslam_torch.synthetic.sites.build import named_site
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
@@ -21,9 +17,6 @@ _PX = 6
 """A cell's side in the picture."""
 _WALL, _AIR, _START, _GOAL = (60, 60, 60), (235, 235, 235), (0, 150, 0), (0, 0, 220)
 _WAY = (200, 90, 20)
-_SIZE, _A_ROW = (320, 240), 4
-_BEFORE_S = (2.0, 1.0, 0.5, 0.0)
-"""Times before the least clearance: the second row of a film strip."""
 
 
 def true_layer(site: Site, limits: NavLimits) -> Layer:
@@ -69,37 +62,6 @@ def top_view(flown: Flown) -> np.ndarray:
     cv2.circle(image, pixel(np.zeros(2)), 6, _START, -1, cv2.LINE_AA)
     cv2.circle(image, pixel(site.goal_w), 6, _GOAL, -1, cv2.LINE_AA)
     words = f"{flown.case.world} {flown.case.seed} {flown.case.fault}: {flown.ended}, {flown.contacts} contacts"
-    return _captioned(image, words)
-
-
-def film_strip(flown: Flown) -> np.ndarray | None:
-    """What the camera saw over the whole flight and before the narrowest moment, ``(H, W, 3)`` BGR; None for a flight
-    that ended before it flew."""
-    if not flown.attitude or len(flown.attitude) != len(flown.track_w):
-        return None
-    site = named_site(flown.case.world, flown.case.seed)
-    camera, T_b_c = PRESETS["tello"].scaled(*_SIZE), camera_on_body()
-    tiles = []
-    for k in moments(flown):
-        clock_s, roll, pitch, yaw, clearance_m = flown.attitude[k]
-        T_w_b = np.eye(4)
-        T_w_b[:3, :3] = matrix_from_rpy(np.array([roll, pitch, yaw]))
-        T_w_b[:3, 3] = flown.track_w[k]
-        tile = picture(site.painted(clock_s), camera, site.T_site_w @ T_w_b @ T_b_c)
-        tiles.append(_captioned(tile, f"{clock_s:.1f} s, {clearance_m:.2f} m"))
-    return np.vstack([np.hstack(tiles[:_A_ROW]), np.hstack(tiles[_A_ROW:])])
-
-
-def moments(flown: Flown) -> list[int]:
-    """Eight ticks: four spread over the flight, then four that end with the least clearance."""
-    attitude: FloatArray = np.array(flown.attitude)
-    spread = np.linspace(0, len(attitude) - 1, _A_ROW).round().astype(int)
-    narrowest_s = attitude[int(np.argmin(attitude[:, 4])), 0]
-    return [*spread.tolist(), *(int(np.argmin(np.abs(attitude[:, 0] - (narrowest_s - s)))) for s in _BEFORE_S)]
-
-
-def _captioned(image: np.ndarray, words: str) -> np.ndarray:
-    """The image with a white caption on a dark strip at its top, in place."""
     cv2.rectangle(image, (0, 0), (image.shape[1], 21), (30, 30, 30), -1)
     cv2.putText(image, words, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return image

@@ -11,7 +11,7 @@ from edgeslam_torch.eval.experiment.conditions import code_state
 from edgeslam_torch.eval.experiment.runner import Local, Task, run_tasks
 from edgeslam_torch.eval.experiment.tables import markdown_table
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
-from edgeslam_torch.eval.judge.navigation.pictures import film_strip, top_view
+from edgeslam_torch.eval.judge.navigation.pictures import top_view
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.plain import write_image
 from edgeslam_torch.jobs.watched import Limits
@@ -19,15 +19,11 @@ from edgeslam_torch.jobs.watched import Limits
 FAILED = "failed"
 """Prefix of the ending of a flight that raised an error."""
 _WORST = 6
-"""Number of worst flights with a top view and a film strip."""
+"""Number of worst flights with a top view."""
 _TIMEOUT_S = 3600.0
 HEAD = (
     "world", "behaviour", "fault", "perception", "flights", "reached", "contact", "no contact and landed on the floor",
     "clearance p5, min [m]", "time over oracle", "cruise [m/s]", "CPU a tick, worst [ms]",
-)  # fmt: skip
-NEAR_HEAD = (
-    "perception", "sectors of 3.7° with an obstacle at 0.3 to 1 m", "more than 0.3 m too far", "less two sigmas",
-    "age of the newest depth, 95 % [s]",
 )  # fmt: skip
 OFF_HEAD = (
     "perception", "ticks with metric scale", "pose error more than 0.1 m beyond three sigmas", "flights with any",
@@ -37,7 +33,7 @@ EXITS_HEAD = ("behaviour", "perception", "exits there", "found", "precision", "r
 
 
 def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[str], None]) -> list[Flown]:
-    """Fly all cases, write a record each, ``navigation.md``, top views and film strips of the worst.
+    """Fly all cases, write a record each, ``navigation.md``, and top views of the worst.
 
     Args:
         cases: Cases to fly.
@@ -72,9 +68,6 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
     seen = [flown for flown in done if flown.track_w]
     for flown in sorted(seen, key=lambda f: (f.reached, not f.contacts, f.clearance_min_m))[:_WORST]:
         write_image(out / f"top_{flown.case.name}.png", top_view(flown))
-        strip = film_strip(flown)
-        if strip is not None:
-            write_image(out / f"film_{flown.case.name}.png", strip)
     return done
 
 
@@ -98,8 +91,8 @@ def _share(successes: int, trials: int) -> str:
 
 
 def markdown(flights: Sequence[Flown]) -> str:
-    """One row for every world and fault, and one for all static worlds without a fault; tables of exits, of near depth
-    and of inconsistent poses where there are any."""
+    """One row for every world and fault, and one for all static worlds without a fault; tables of exits and
+    of inconsistent poses where there are any."""
     by_case = _grouped(flights, "perception", "behaviour", "fault", "world")
     rows = [_row(key[::-1], group) for key, group in by_case.items()]
     plain = [f for f in flights if f.case.fault == "none"]
@@ -109,11 +102,9 @@ def markdown(flights: Sequence[Flown]) -> str:
             kinds = (", ".join(sorted({getattr(f.case, k) for f in group})) for k in ("behaviour", "perception"))
             rows.append(_row((*names, *kinds), group))
     exits = [_exits_row(key, group) for key, group in _grouped(flights, "perception", "behaviour").items()]
-    by_perception = _grouped(flights, "perception").items()
-    near = [_near_row(name, group) for (name,), group in by_perception]
-    off = [_off_row(name, [f for f in group if f.off[0]]) for (name,), group in by_perception]
+    off = [_off_row(name, [f for f in group if f.off[0]]) for (name,), group in _grouped(flights, "perception").items()]
     text = markdown_table(HEAD, rows) + "\n"
-    for head, lines in ((EXITS_HEAD, exits), (NEAR_HEAD, near), (OFF_HEAD, off)):
+    for head, lines in ((EXITS_HEAD, exits), (OFF_HEAD, off)):
         known = [line for line in lines if line]
         text += f"\n{markdown_table(head, known)}\n" if known else ""
     return text
@@ -131,15 +122,6 @@ def _exits_row(names: tuple[str, ...], group: Sequence[Flown]) -> list[str]:
     if not there and not found:
         return []
     return [names[1], names[0], f"{there}", f"{found}", _share(right, found), _share(right, there)]
-
-
-def _near_row(perception: str, group: Sequence[Flown]) -> list[str]:
-    sectors, *far = np.sum([f.near for f in group], axis=0).tolist()
-    if not sectors:
-        return []
-    ages = [f.depth_age_s for f in group if math.isfinite(f.depth_age_s[0])] or [[math.nan, math.nan]]
-    age = np.median(ages, axis=0)
-    return [perception, f"{sectors}", *(f"{100 * n / sectors:.1f} %" for n in far), f"{age[0]:.2f}, {age[1]:.2f}"]
 
 
 def _off_row(perception: str, group: Sequence[Flown]) -> list[str]:

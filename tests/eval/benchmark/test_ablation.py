@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from markdown_rows import rows
 
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import ConfigError
@@ -53,11 +54,7 @@ def test_every_row_is_run_with_its_settings_beside_those_it_is_compared_with(run
 def test_table_names_what_got_worse_and_leaves_the_rest_alone(runs, tmp_path):
     text = markdown_ablation(ablation(tmp_path, seeds=(0, 1), max_frames=300))
     assert "first 300 frames, seeds 0 1" in text
-    lines = {
-        line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:-1]]
-        for line in text.splitlines()
-        if "|" in line
-    }
+    lines = {name: cells for name, *cells in rows(text)}
     assert lines["default"][:2] == ["0.0101", "-"] and lines["default"][-1] == ""
     assert lines["no edge alignment"][-1] == "default: ATE Sim(3) worse"
     assert lines["no depth network"][-1] == "default: ATE Sim(3) worse"
@@ -85,7 +82,7 @@ def test_unknown_names_are_refused(runs, tmp_path, names, only, message):
 
 def test_depth_networks_are_beside_each_other(runs, tmp_path):
     records = compare_networks(BenchSettings(tmp_path, seeds=(0,)), ["default", "none"], tmp_path, lambda line: None)
-    lines = [[c.strip() for c in line.split("|")[1:-1]] for line in markdown_networks(records).splitlines()[2:]]
+    lines = rows(markdown_networks(records))[1:]
     assert [line[:4] for line in lines] == [
         ["default", "kitchen, seed 0", "0.0100", "-"],
         ["none", "kitchen, seed 0", "0.0300", "-"],
