@@ -1,10 +1,10 @@
-"""Trajectory files: TUM, EuRoC, KITTI and 7-Scenes, read and written.
+"""Trajectory files: TUM, EuRoC, KITTI and 7-Scenes are read, TUM is written.
 
 All give poses of the camera in the world; those of a body whose camera is not known stay the body's. Every reader
 refuses what cannot be a trajectory with one line that names the file and the likely mistake.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.columns import Columns, columns_by_name, columns_by_number
-from edgeslam_torch.files.atomic import write_atomically, write_text
+from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.record_files import plain_yaml
 from edgeslam_torch.files.tables import Table, read_table
 from edgeslam_torch.files.time_units import UNKNOWN, seconds_of
@@ -110,54 +110,6 @@ def write_tum(trajectory: Trajectory, path: Path | str) -> None:
         for stamp, T in zip(trajectory.stamps_s, trajectory.T_w_c, strict=True)
     ]
     write_text(Path(path), "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n")
-
-
-def write_euroc(trajectory: Trajectory, path: Path | str) -> None:
-    """Write EuRoC's ``ns, px, py, pz, qw, qx, qy, qz`` followed by zero velocity and biases."""
-    header = "#timestamp [ns],px,py,pz,qw,qx,qy,qz,vx,vy,vz,bwx,bwy,bwz,bax,bay,baz"
-    rows = []
-    for stamp, T in zip(trajectory.stamps_s, trajectory.T_w_c, strict=True):
-        x = se3.pose_to_tum(T)
-        numbers = [f"{v:.9f}" for v in (*x[:3], x[6], *x[3:6])] + ["0"] * 9
-        rows.append(f"{round(stamp * 1e9)}," + ",".join(numbers))
-    write_text(Path(path), header + "\n" + "\n".join(rows) + "\n")
-
-
-def write_kitti(trajectory: Trajectory, path: Path | str) -> None:
-    """Write 12 numbers a row and the stamps to ``times.txt`` beside it."""
-    path = Path(path)
-    _write_numbers(path, trajectory.T_w_c[:, :3, :].reshape(-1, 12), "%.9e")
-    _write_numbers(path.with_name(_TIMES), trajectory.stamps_s, "%.9f")
-
-
-def write_seven_scenes(trajectory: Trajectory, folder: Path | str) -> None:
-    """Write one ``frame-NNNNNN.pose.txt`` a pose.
-
-    The number is the stamp in 30 Hz frames where the stamps are such (7-Scenes' own); else poses are numbered in
-    order and their stamps written to ``times.txt`` beside them, as for KITTI.
-    """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    frames = trajectory.stamps_s * SEVEN_SCENES_HZ
-    numbers = np.round(frames).astype(int)
-    own = numbers[0] >= 0 and numbers[-1] < 10**6 and np.abs(frames - numbers).max() < 0.01
-    if not own:
-        numbers = np.arange(len(numbers))
-        _write_numbers(folder / _TIMES, trajectory.stamps_s, "%.9f")
-    for number, T in zip(numbers, trajectory.T_w_c, strict=True):
-        _write_numbers(folder / f"frame-{number:06d}.pose.txt", T, "%.9e")
-
-
-def _write_numbers(path: Path, table: FloatArray, number: str) -> None:
-    write_atomically(path, lambda file: np.savetxt(file, table, fmt=number))
-
-
-WRITERS: dict[str, Callable[[Trajectory, Path | str], None]] = {
-    "tum": write_tum,
-    "euroc": write_euroc,
-    "kitti": write_kitti,
-    "7scenes": write_seven_scenes,
-}
 
 
 def _read_folder(folder: Path) -> Trajectory:

@@ -1,5 +1,6 @@
 """A cell's run and its figures: what the process of a cell does."""
 
+import math
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.conditions import orb_pass_ms
 from edgeslam_torch.eval.inputs.dataset import interpolate, open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
-from edgeslam_torch.eval.judge import flights, second_flight, sources
+from edgeslam_torch.eval.judge import flights, sources
 from edgeslam_torch.eval.judge.cells import BACKWARDS, CASES, CUT, KIDNAP, SECOND_FLIGHT, VARIANTS, Cell
 from edgeslam_torch.eval.judge.score import Truth, score
 from edgeslam_torch.eval.judge.simulated_imu import IMU_KINDS, RECORDED
@@ -27,6 +28,8 @@ RUN, FIRST, ATLAS = "run", "first", "first.atlas"
 """In a cell's folder: its run; of two flights, the first one's run and map."""
 CUT_FRAMES = 160
 """Of either world."""
+_NEVER_S = 1e3
+"""Stands for a map that is never recognised."""
 
 
 def run_cell(case: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -56,9 +59,25 @@ def run_cell(case: dict[str, Any], folder: Path) -> dict[str, Any]:
     figures, notes = score(folder / RUN, truth)
     figures |= {"cpu_ms": cpu_ms, "orb_ms": orb_ms, "cpu_orb": cpu_ms / orb_ms}
     if cell.variant == SECOND_FLIGHT:
-        figures |= second_flight.compared(folder / RUN, truth, folder / FIRST, first_truth)
+        first_scale = score(folder / FIRST, first_truth)[0].get("scale_sim3")
+        figures |= _beside_first(result, figures.get("scale_sim3"), first_scale)
     figures["took_s"] = time.monotonic() - begin_s
     return {"figures": figures, "notes": notes}
+
+
+def _beside_first(result: RunResult, scale: float | None, first_scale: float | None) -> dict[str, float | None]:
+    """Figures of a flight that started with the map of another.
+
+    Returns:
+        ``placed_after_s`` until the first frame in that map, ``placed`` share of frames in it, and ``metres_off``
+        absolute log of the ratio of the true lengths of the two flights' units.
+    """
+    found = result.summary["atlas"]
+    return {
+        "placed_after_s": _NEVER_S if found["found_after_s"] is None else found["found_after_s"],
+        "placed": found["frames_placed"] / max(result.summary["frames"], 1),
+        "metres_off": abs(math.log(scale / first_scale)) if scale and first_scale else None,
+    }
 
 
 def _flown(source: Recording, out: Path, config: SlamConfig, atlas: AtlasFiles) -> RunResult:

@@ -39,16 +39,15 @@ class DepthScore:
     """Factor applied to the prediction: 1 for metric figures, the ratio of medians for scaled ones."""
 
 
-@dataclass(frozen=True, slots=True)
-class DepthReport:
-    """Errors of one prediction: metric and scaled, everywhere and at edges."""
-
-    metric: DepthScore
-    median_scaled: DepthScore
-    """After median scaling of each map: the error if scale comes from elsewhere."""
-    edges_metric: DepthScore | None
-    """Edge pixels alone; None without an image."""
-    edges_median_scaled: DepthScore | None
+DepthReport = dict[str, DepthScore]
+"""Scores by `TITLES`' names; those of edges are missing without an image."""
+TITLES = {
+    "metric": "metric",
+    "median_scaled": "median-scaled",
+    "edges_metric": "edges, metric",
+    "edges_median_scaled": "edges, median-scaled",
+}
+"""As they are, and after median scaling of each map: the error if scale comes from elsewhere; all pixels, or edges."""
 
 
 def score_depth(
@@ -89,14 +88,14 @@ def score_depth(
 
 def report_depth(prediction: FloatArray, truth: FloatArray, image: NDArray[np.uint8] | None = None) -> DepthReport:
     """All four figures of one map; ``image`` ``(H, W[, 3])`` of the same size gives the edges."""
-    edges = edge_mask(image) if image is not None else None
-    has_edges = edges is not None and bool((edges & (np.squeeze(truth) > 0)).any())
-    return DepthReport(
-        score_depth(prediction, truth),
-        score_depth(prediction, truth, median_scaled=True),
-        score_depth(prediction, truth, edges) if has_edges else None,
-        score_depth(prediction, truth, edges, median_scaled=True) if has_edges else None,
-    )
+    masks: dict[str, NDArray[np.bool_] | None] = {"": None}
+    if image is not None and ((edges := edge_mask(image)) & (np.squeeze(truth) > 0)).any():
+        masks["edges_"] = edges
+    return {
+        f"{where}{kind}": score_depth(prediction, truth, mask, median_scaled=kind == "median_scaled")
+        for where, mask in masks.items()
+        for kind in ("metric", "median_scaled")
+    }
 
 
 def edge_mask(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -118,14 +117,8 @@ def mean_score(scores: Iterable[DepthScore]) -> DepthScore:
 def mean_report(reports: Iterable[DepthReport]) -> DepthReport:
     """Mean over maps of all four figures; edges over the maps that have any."""
     found = list(reports)
-    edges = [r.edges_metric for r in found if r.edges_metric is not None]
-    scaled = [r.edges_median_scaled for r in found if r.edges_median_scaled is not None]
-    return DepthReport(
-        mean_score(r.metric for r in found),
-        mean_score(r.median_scaled for r in found),
-        mean_score(edges) if edges else None,
-        mean_score(scaled) if scaled else None,
-    )
+    there = [name for name in TITLES if any(name in report for report in found)]
+    return {name: mean_score(report[name] for report in found if name in report) for name in there}
 
 
 def read_depth(path: Path, metres_per_unit: float = 1.0 / 5000.0) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 from edgeslam_torch.eval.experiment.figures import Figure
 from edgeslam_torch.eval.experiment.tables import markdown_table, text_table
 from edgeslam_torch.eval.metrics.common_frames import CommonScore
-from edgeslam_torch.eval.metrics.depth_error import DepthReport
+from edgeslam_torch.eval.metrics.depth_error import TITLES, DepthReport
 from edgeslam_torch.eval.metrics.edge_map_score import THRESHOLDS_M
 from edgeslam_torch.eval.metrics.run_score import RunScore
 
@@ -77,16 +77,8 @@ def report_of_two(first: RunScore, second: RunScore) -> str:
 
 def depth_report(report: DepthReport) -> str:
     """Figures of depth maps."""
-    rows = [
-        [name, *(f"{v:.4f}" for v in (s.abs_rel, s.rmse_m, s.log_rmse, s.delta1, s.delta2, s.delta3, s.scale))]
-        for name, s in (
-            ("metric", report.metric),
-            ("median-scaled", report.median_scaled),
-            ("edges, metric", report.edges_metric),
-            ("edges, median-scaled", report.edges_median_scaled),
-        )
-        if s is not None
-    ]
+    names = ("abs_rel", "rmse_m", "log_rmse", "delta1", "delta2", "delta3", "scale")
+    rows = [[TITLES[k], *(f"{getattr(score, name):.4f}" for name in names)] for k, score in report.items()]
     return markdown_table(["pixels", "AbsRel", "RMSE [m]", "log RMSE", "delta1", "delta2", "delta3", "scale"], rows)
 
 

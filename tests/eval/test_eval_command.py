@@ -5,12 +5,13 @@ import json
 
 import numpy as np
 import pytest
+from markdown_rows import row, rows
 
 from edgeslam_torch.commands import report as report_command
 from edgeslam_torch.commands.judging import compare as compare_command
 from edgeslam_torch.commands.judging import eval as eval_command
 from edgeslam_torch.errors import EdgeSlamError
-from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory, write_kitti
+from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
 from edgeslam_torch.eval.metrics.run_score import evaluate_run
 
 
@@ -28,11 +29,10 @@ def test_several_runs_give_an_aligned_table(run_folder, tmp_path, capsys):
     assert run(eval_command, *runs, "--groundtruth", truth, *out) == 0
     text = capsys.readouterr().out
     assert "median" not in text, "they may be of different systems"
-    head, *rows = text.split("\n\n")[1].splitlines()[-4:]
-    assert [row.split()[0] for row in rows] == ["a", "b", "trajectory_online.txt"]
-    assert len({len(line) for line in (head, *rows)}) == 1 and len(head) < 130
+    lines = text.split("\n\n")[1].splitlines()[-3:]
+    assert [line.split()[0] for line in lines] == ["a", "b", "trajectory_online.txt"]
     markdown = (tmp_path / "s.md").read_text()
-    assert "| a |" in markdown and "| b |" in markdown
+    assert {"a", "b"} <= {row[0] for row in rows(markdown)}
     records = json.loads((tmp_path / "s.json").read_text())
     assert [r["name"] for r in records] == ["a", "b", "trajectory_online.txt"]
     assert records[1]["scale_error"] == pytest.approx(0.2, abs=0.01)
@@ -52,7 +52,7 @@ def own_recording(run_dir, truth):
 def test_a_run_is_judged_by_the_truth_of_its_recording(run_folder, tmp_path, capsys):
     own_recording(tmp_path / "a", run_folder(tmp_path / "a"))
     assert run(eval_command, tmp_path / "a", "--markdown", "-", "--json", tmp_path / "s.json") == 0
-    assert "| a | 0.0" in capsys.readouterr().out
+    assert float(row(capsys.readouterr().out, "a")["ATE Sim(3) [m]"]) < 0.05
     json.loads((tmp_path / "s.json").read_text(), parse_constant=pytest.fail)
     with pytest.raises(EdgeSlamError, match="--groundtruth"):
         run(eval_command, tmp_path / "a" / "trajectory.txt")
@@ -96,8 +96,7 @@ def test_file_without_stamps_is_laid_on_the_images(run_folder, tmp_path):
     (tmp_path / "truth.txt").rename(dataset / "groundtruth.txt")
     stamps = np.loadtxt(dataset / "groundtruth.txt")[:, 0]
     (dataset / "rgb.txt").write_text("".join(f"{t:.6f} rgb/{t:.6f}.png\n" for t in stamps))
-    write_kitti(read_trajectory(tmp_path / "a"), tmp_path / "poses.txt")
-    (tmp_path / "times.txt").unlink()
+    np.savetxt(tmp_path / "poses.txt", read_trajectory(tmp_path / "a").T_w_c[:, :3].reshape(-1, 12))
     score = evaluate_run(tmp_path / "poses.txt", dataset)
     assert score.matched == 200 and score.ate_sim3_m < 0.02
     assert "in order" in score.notes[0]
@@ -161,14 +160,5 @@ def test_depth_maps_are_judged_by_name(tmp_path, capsys):
         np.save(tmp_path / name / "0001.npy", np.full((4, 6), metres))
     words = (tmp_path / "ours", "--groundtruth", tmp_path / "truth", "--depth-maps", "--json", tmp_path / "d.json")
     assert run(eval_command, *words) == 0
-    assert "| metric | 0.1000 |" in capsys.readouterr().out
+    assert row(capsys.readouterr().out, "metric")["AbsRel"] == "0.1000"
     assert json.loads((tmp_path / "d.json").read_text())[str(tmp_path / "ours")]["median_scaled"]["delta1"] == 1.0
-
-
-def test_first_trajectory_is_converted(run_folder, tmp_path):
-    truth = run_folder(tmp_path / "a")
-    words = (tmp_path / "a", "--groundtruth", truth, "--convert")
-    assert run(eval_command, *words, "euroc", tmp_path / "t.csv") == 0
-    assert (tmp_path / "t.csv").read_text().splitlines()[1].startswith("100000000000,")
-    with pytest.raises(EdgeSlamError, match="known formats"):
-        run(eval_command, *words, "rosbag", tmp_path / "t")

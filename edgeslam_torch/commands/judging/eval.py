@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from edgeslam_torch.errors import ConfigError, EdgeSlamError, OutputError
 from edgeslam_torch.extras import needs_extra
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.files.output_file import add_overwrite_to, check_new, check_not_read, output_file
+from edgeslam_torch.files.output_file import add_overwrite_to, check_new, output_file
 
 if TYPE_CHECKING:
     from edgeslam_torch.eval.metrics.common_frames import CommonScore
@@ -60,12 +60,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="DIR",
         help="write a picture of each run's errors into this folder, and one of all trajectories over the truth",
-    )
-    parser.add_argument(
-        "--convert",
-        nargs=2,
-        metavar=("FORMAT", "PATH"),
-        help="also write the (first) trajectory as tum, euroc, kitti or 7scenes",
     )
     add_overwrite_to(parser)
 
@@ -164,7 +158,7 @@ def one_groundtruth(truths: list[Path]) -> Path:
 def _depth_maps(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from edgeslam_torch.eval.metrics.depth_error import compare_folders, compare_with_recording
+    from edgeslam_torch.eval.metrics.depth_error import TITLES, compare_folders, compare_with_recording
     from edgeslam_torch.eval.report.tables import depth_report
 
     truth = args.groundtruth
@@ -180,37 +174,18 @@ def _depth_maps(args: argparse.Namespace) -> int:
         if args.markdown is not None:
             write_text(args.markdown, text)
         if args.json is not None:
-            write_text(args.json, json.dumps({k: asdict(v) for k, v in reports.items()}, indent=1) + "\n")
+            records = {k: {n: asdict(v[n]) if n in v else None for n in TITLES} for k, v in reports.items()}
+            write_text(args.json, json.dumps(records, indent=1) + "\n")
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
     return 0
 
 
 def _write_files(args: argparse.Namespace, scores: "list[RunScore]", judged: list[tuple[Path, Path]]) -> None:
-    from edgeslam_torch.eval.inputs.trajectory_files import WRITERS, read_trajectory
-
     if args.json is not None:
         write_text(args.json, json.dumps([s.to_dict() for s in scores], indent=1, default=str) + "\n")
     if args.plots is not None:
         _plot(args.plots, scores, judged, args.overwrite)
-    if args.convert is not None:
-        name, target = args.convert
-        if name not in WRITERS:
-            raise OutputError(f"--convert {name}: known formats are {', '.join(WRITERS)}")
-        trajectory = read_trajectory(judged[0][0])
-        if not trajectory.oriented:
-            raise OutputError(f"{trajectory.source}: positions alone, and {name} has orientations: not converted")
-        for path in _conversion(name, Path(target)):
-            check_not_read(path, (read for pair in judged for read in pair), "--convert")
-            check_new(path, args.overwrite, "--convert")
-        WRITERS[name](trajectory, target)
-
-
-def _conversion(name: str, target: Path) -> list[Path]:
-    """What would be written, of many poses the first that is there."""
-    if name == "7scenes":
-        return [*sorted(target.glob("*.pose.txt"))[:1], target / "times.txt"]
-    return [target, target.with_name("times.txt")] if name == "kitti" else [target]
 
 
 def _plot(folder: Path, scores: "list[RunScore]", judged: list[tuple[Path, Path]], overwrite: bool) -> None:

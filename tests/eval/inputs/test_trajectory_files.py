@@ -8,31 +8,54 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.clocks import on_one_clock
-from edgeslam_torch.eval.inputs.trajectory_files import WRITERS, Trajectory, read_trajectory
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory, write_tum
 
 
-@pytest.mark.parametrize("name", sorted(WRITERS))
-def test_every_format_round_trips(name, loop, tmp_path):
-    start = Trajectory(np.arange(len(loop)) / 30.0, loop.T_w_c, "loop")
-    path = tmp_path / {"euroc": "data.csv", "7scenes": "seq"}.get(name, "poses.txt")
-    WRITERS[name](start, path)
-    back = read_trajectory(path)
-    np.testing.assert_allclose(back.stamps_s, start.stamps_s, atol=1e-6)
-    np.testing.assert_allclose(back.T_w_c, start.T_w_c, atol=1e-8)
+def euroc(trajectory, path):
+    """Nanoseconds, position, quaternion with its scalar first, and nine numbers of no interest."""
+    q = Rotation.from_matrix(trajectory.T_w_c[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    rows = np.c_[trajectory.positions, q, np.zeros((len(q), 9))]
+    lines = [",".join([ns(t), *map(str, row)]) for t, row in zip(trajectory.stamps_s, rows, strict=True)]
+    path.write_text("#timestamp [ns],px,py,pz,qw,qx,qy,qz,vx,vy,vz,bwx,bwy,bwz,bax,bay,baz\n" + "\n".join(lines) + "\n")
 
 
-@pytest.mark.parametrize("name", ["kitti", "7scenes"])
-def test_formats_without_stamps_keep_those_of_another_clock_beside_them(name, loop, tmp_path):
-    start = Trajectory(1.3e9 + np.sort(np.random.default_rng(0).uniform(0, 9, len(loop))), loop.T_w_c, "loop")
-    path = tmp_path / {"7scenes": "seq"}.get(name, "poses.txt")
-    WRITERS[name](start, path)
-    back = read_trajectory(path)
+def kitti(trajectory, path):
+    np.savetxt(path, trajectory.T_w_c[:, :3].reshape(-1, 12))
+    np.savetxt(path.with_name("times.txt"), trajectory.stamps_s)
+
+
+def seven_scenes(trajectory, folder):
+    folder.mkdir()
+    for k, T in enumerate(trajectory.T_w_c):
+        np.savetxt(folder / f"frame-{k:06d}.pose.txt", T)
+    np.savetxt(folder / "times.txt", trajectory.stamps_s)
+
+
+@pytest.mark.parametrize("begin", [0.0, 1.3e9])
+@pytest.mark.parametrize(
+    ("write", "name"), [(write_tum, "poses.txt"), (euroc, "data.csv"), (kitti, "poses.txt"), (seven_scenes, "seq")]
+)
+def test_every_format_is_read(write, name, begin, loop, tmp_path):
+    stamps = begin + np.sort(np.random.default_rng(0).uniform(0, 9, len(loop)))
+    write(Trajectory(stamps, loop.T_w_c, "loop"), tmp_path / name)
+    back = read_trajectory(tmp_path / name)
     assert back.stamped
-    np.testing.assert_allclose(back.stamps_s, start.stamps_s, atol=1e-6)
-    times = next(tmp_path.rglob("times.txt"))
-    times.write_text("0.0\n0.1\n")
+    np.testing.assert_allclose(back.stamps_s, stamps, atol=1e-6)
+    np.testing.assert_allclose(back.T_w_c, loop.T_w_c, atol=1e-8)
+
+
+@pytest.mark.parametrize(("write", "name"), [(kitti, "poses.txt"), (seven_scenes, "seq")])
+def test_stamps_beside_poses_are_as_many(write, name, loop, tmp_path):
+    write(loop, tmp_path / name)
+    next(tmp_path.rglob("times.txt")).write_text("0.0\n0.1\n")
     with pytest.raises(EvaluationError, match="200 poses but 2 stamps"):
-        read_trajectory(path)
+        read_trajectory(tmp_path / name)
+
+
+def test_frames_of_seven_scenes_without_stamps_are_those_of_its_sensor(loop, tmp_path):
+    seven_scenes(loop, tmp_path / "seq")
+    (tmp_path / "seq" / "times.txt").unlink()
+    np.testing.assert_allclose(read_trajectory(tmp_path / "seq").stamps_s, np.arange(len(loop)) / 30.0)
 
 
 def tum(path, rows):
@@ -122,7 +145,7 @@ def euroc_folder(folder, body, sensor):
     (folder / "mav0" / "cam0" / "sensor.yaml").write_text(f"%YAML:1.0\nsensor_type: camera\n{sensor}")
     truth = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
     truth.parent.mkdir()
-    WRITERS["euroc"](body, truth)
+    euroc(body, truth)
     return truth
 
 
@@ -240,7 +263,7 @@ def test_tum_vi_truth_is_found_and_becomes_the_cameras(loop, tmp_path):
 
 
 def test_rows_of_kitti_without_times_take_those_of_as_many_poses(loop, tmp_path):
-    WRITERS["kitti"](loop, tmp_path / "poses.txt")
+    kitti(loop, tmp_path / "poses.txt")
     (tmp_path / "times.txt").unlink()
     rows = read_trajectory(tmp_path / "poses.txt")
     np.testing.assert_allclose(on_one_clock(rows, loop)[0].stamps_s, loop.stamps_s)

@@ -63,7 +63,7 @@ def test_bar_that_says_nothing_is_refused(tmp_path):
 
 def test_own_bars_name_figures_that_the_judge_has():
     known = {column.name for column in COLUMNS} | {"online_percent", "metric"}
-    known |= {"placed_after_s", "placed", "placed_late_s", "metres_off", "metres_off_depth"}
+    known |= {"placed_after_s", "placed", "metres_off"}
     known |= {"scale_off", "scale_sigmas", "by_telemetry", "said"}
     assert {threshold.figure for threshold in read_thresholds()} <= known
 
