@@ -281,9 +281,9 @@ def read_peers(path: Path = _PEERS) -> list[dict[str, Any]]:
 
 def markdown_compare(before: dict[str, Any], after: dict[str, Any]) -> str:
     """Medians of two records and what differs by more than the noise, and what to beware of."""
-    sides = (grouped(record["runs"], "sequence") for record in (before, after))
+    table = markdown_comparison(grouped(before["runs"], "sequence"), grouped(after["runs"], "sequence"), FIGURES)
     head = f"{before.get('commit')} -> {after.get('commit')}, medians, ratio; ! worse, + better by more than the noise"
-    return "\n".join([head, *other_conditions(before, after), "", markdown_comparison(*sides, FIGURES)])
+    return "\n".join([head, *other_conditions(before, after), "", table])
 
 
 def markdown_bench(record: dict[str, Any]) -> str:

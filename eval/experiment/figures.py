@@ -17,7 +17,7 @@ _MOST_NAMED = 8
 """Names of only one of two records that are listed."""
 _CONDITIONS = ("machine", "seeds", "mode", "max_frames", "overrides")
 
-Run = Mapping[str, Any]
+Run = dict[str, Any]
 """A run, with its ``figures`` by name; None where it has none."""
 Groups = Mapping[str, Sequence[Run]]
 """Runs of one source with several seeds, by the source's name."""

@@ -74,14 +74,6 @@ def release_cells(data: Path | None) -> list[Cell]:
     return [cell for cell in found if cell.seed < RUNS[cell.name]]
 
 
-def last_cost(path: Path) -> str:
-    """What the record that will be replaced took, in words; empty without one."""
-    if not path.is_file():
-        return ""
-    last = read_mapping(path, "JSON", EvaluationError)
-    return f", {last.get('took_minutes')} minutes of one process in {last.get('version')}"
-
-
 def release_record(rows: Sequence[Row], commit: str, outputs: dict[str, list[str]]) -> dict[str, Any]:
     """Medians and ranges of the release's runs with their conditions.
 

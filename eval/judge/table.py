@@ -78,9 +78,8 @@ def markdown(record: dict[str, Any], thresholds: Sequence[Threshold]) -> str:
 def markdown_against(before: dict[str, Any], after: dict[str, Any]) -> str:
     """Both records' medians and their ratio, cell by cell."""
     head = f"{before['commit']} -> {after['commit']}, medians, ratio; ! worse, + better by more than the noise"
-    sides = (grouped(record["rows"], "cell") for record in (before, after))
-    beware = other_conditions(before, after)
-    return "\n".join([head, *beware, "", markdown_comparison(*sides, COLUMNS)])
+    table = markdown_comparison(grouped(before["rows"], "cell"), grouped(after["rows"], "cell"), COLUMNS)
+    return "\n".join([head, *other_conditions(before, after), "", table])
 
 
 def _conditions(record: dict[str, Any]) -> str:

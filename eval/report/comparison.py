@@ -102,39 +102,15 @@ def _about(index: int, side: _Side) -> str:
 def _figures(sides: Sequence[_Side]) -> list[list[str]]:
     """Name, both values, and their difference where both are numbers of one unit."""
     rows = []
-    for name, *pair in ((a[0], a[1:], b[1:]) for a, b in zip(_numbers(sides[0]), _numbers(sides[1]), strict=True)):
-        known = [np.isfinite(value) for value, _, _ in pair]
-        texts = [f"{v:.{digits}f}{unit}" if ok else _NONE for (v, digits, unit), ok in zip(pair, known, strict=True)]
-        (a, digits, unit), (b, _, other) = pair
-        if any(known):
-            rows.append([name, *texts, f"{b - a:+.{digits}f}{unit}" if all(known) and unit == other else ""])
+    for a, b in zip(*(words.figures(side.run, side.score) for side in sides), strict=True):
+        texts = [
+            f"{value:.{digits}f} {unit}".rstrip() if np.isfinite(value) else _NONE for _, value, digits, unit in (a, b)
+        ]
+        change = b[1] - a[1]
+        difference = f"{change:+.{a[2]}f} {a[3]}".rstrip() if np.isfinite(change) and a[3] == b[3] else ""
+        if texts != [_NONE, _NONE]:
+            rows.append([a[0], *texts, difference])
     return rows
-
-
-def _numbers(side: _Side) -> list[tuple[str, float, int, str]]:
-    """Figures: name, value (NaN where the run has none), digits after the point, unit."""
-    summary, score = side.run.summary, side.score
-    scale, counts = words.record(summary.get("scale")), words.record(summary.get("map"))
-    metric, there = score is not None and score.units == "metres", score is not None and score.map is not None
-    steps = np.linalg.norm(np.diff(side.positions, axis=0), axis=1)
-    sigma = 100 * words.number(scale.get("sigma")) / (words.number(scale.get("value")) or np.nan)
-    return [
-        ("position error (ATE, Sim(3))", 100 * score.ate_sim3_m if score else np.nan, 2, " cm"),
-        ("position error without scaling (SE(3))", 100 * score.ate_se3_m if score and metric else np.nan, 2, " cm"),
-        ("rotation error", score.rotation_deg if score else np.nan, 2, "\u00b0"),
-        ("map error (median)", 100 * score.map.median_m if score and score.map and there else np.nan, 2, " cm"),
-        ("frames", words.number(summary.get("offered", len(side.run.trajectory))), 0, ""),
-        ("frames tracked", side.run.trusted_frames, 0, ""),
-        ("times lost", words.number(summary.get("lost_events")), 0, ""),
-        ("scale, 1 sigma", sigma if scale.get("units") == "metres" else np.nan, 1, " %"),
-        ("length of the path", float(steps.sum()), 2, f" {words.unit(side.run)}"),
-        ("keyframes", words.number(counts.get("keyframes")), 0, ""),
-        ("anchors", words.number(counts.get("anchors")), 0, ""),
-        ("edge points", words.number(counts.get("edge_points")), 0, ""),
-        ("frames per second", words.number(summary.get("fps")), 1, ""),
-        ("CPU per frame", words.number(summary.get("cpu_ms_per_frame")), 1, " ms"),
-        ("memory", words.number(summary.get("peak_rss_mb")), 0, " MB"),
-    ]
 
 
 def _paths(sides: Sequence[_Side]) -> str:

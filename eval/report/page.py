@@ -131,7 +131,7 @@ def _payload(
         "title": words.title(run),
         "story": words.story(run, score),
         "warnings": words.warnings(run.summary),
-        "tiles": words.tiles(run, score, len(edges.p_w)),
+        "tiles": words.tiles(run, score),
         "foot": words.foot(run),
         "unit": words.unit(run),
         "edges": edge_meta,
@@ -166,7 +166,7 @@ class _StatusTable:
 
     def __init__(self, run: RunFolder, trajectory: Trajectory) -> None:
         self.all_rows = run.status
-        self.all_stamps = np.array([_number(r, "stamp", "stamp_s", "timestamp") for r in run.status], dtype=np.float64)
+        self.all_stamps = np.array([_number(r, "stamp_s") for r in run.status], dtype=np.float64)
         self.rows: list[dict[str, str]] = []
         if len(self.all_stamps) and np.isfinite(self.all_stamps).all():
             order = np.argsort(self.all_stamps, kind="stable")
@@ -179,9 +179,9 @@ class _StatusTable:
         everything = [_status_code(r) for r in run.status] or self.codes
         self.counts = [everything.count(k) for k in range(len(STATUSES))]
 
-    def column(self, *names: str) -> list[float | None] | None:
+    def column(self, name: str) -> list[float | None] | None:
         """Numbers of a column, None where missing; None when the file lacks it."""
-        values = [_number(r, *names) for r in self.rows]
+        values = [_number(r, name) for r in self.rows]
         if not any(np.isfinite(values)):
             return None
         return [round(v, 5) if np.isfinite(v) else None for v in values]
@@ -197,8 +197,7 @@ class _StatusTable:
 
     def scale(self, note: str) -> dict[str, Any] | None:
         """Scale over time with its 95 % interval, when the run had one."""
-        value = self.column("scale", "scale_value")
-        sigma = self.column("scale_sigma", "sigma", "sigma_scale")
+        value, sigma = self.column("scale"), self.column("scale_sigma")
         if value is None or sigma is None:
             return None
         both = list(zip(value, sigma, strict=True))
@@ -246,14 +245,9 @@ def _status_code(row: dict[str, str]) -> int:
     return STATUSES.index(status) if status in STATUSES else STATUSES.index("lost")
 
 
-def _number(row: dict[str, str], *names: str) -> float:
-    for name in names:
-        try:
-            value = float(row.get(name, ""))
-        except ValueError:
-            continue
-        return value if np.isfinite(value) else float("nan")
-    return float("nan")
+def _number(row: dict[str, str], name: str) -> float:
+    value = words.number(row.get(name))
+    return value if np.isfinite(value) else float("nan")
 
 
 def upright(trajectory: Trajectory, score: RunScore | None, truth: Trajectory | None) -> FloatArray:

@@ -5,6 +5,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported
 from edgeslam_torch.eval.metrics.run_score import RunScore
 
@@ -108,34 +110,64 @@ def warnings(summary: dict[str, Any]) -> list[str]:
     return [without_folders(str(sentence)) for sentence in said] if isinstance(said, list) else []
 
 
-def tiles(run: RunFolder, score: RunScore | None, points: int) -> list[dict[str, str]]:
-    """Key figures at the top of the page."""
+Value = tuple[str, float, int, str]
+"""Name, value (NaN where there is none), digits after the point, and unit of a figure."""
+
+_ON_TILES = {
+    "position error (ATE, Sim(3))",
+    "map error (median)",
+    "frames tracked",
+    "edge points",
+    "scale, 1 sigma",
+    "up, 1 sigma",
+    "frames per second",
+    "CPU per frame",
+    "memory",
+}
+
+
+def figures(run: RunFolder, score: RunScore | None) -> list[Value]:
+    """What the pages show of a run in numbers."""
     summary, frames = run.summary, _offered(run)
-    out: list[tuple[str, str, str]] = []
-    if score is not None:
-        out.append((f"{100 * score.ate_sim3_m:.2f}", "cm", "position error (ATE, Sim(3))"))
-        if score.map is not None:
-            out.append((f"{100 * score.map.median_m:.2f}", "cm", "map error (median)"))
-    if frames and run.status:
-        out.append((f"{100 * run.trusted_frames / frames:.1f}", "%", "frames tracked"))
-    if points:
-        out.append((f"{points:,}".replace(",", "\u2009"), "", "map points shown"))
-    if isinstance(scale := summary.get("scale"), dict):
-        value, sigma = number(scale.get("value")), number(scale.get("sigma"))
-        known = scale.get("units") != "arbitrary" and math.isfinite(sigma)
-        share = f"\u00b1{100 * sigma / value:.1f}" if value else "?"
-        out.append((share, "%", "scale, 1 sigma") if known else ("unknown", "", "scale"))
-    if isinstance(up := summary.get("up"), dict):
-        sigma = number(up.get("sigma_deg"))
-        out.append((f"\u00b1{sigma:.1f}", "\u00b0", "up, 1 sigma") if math.isfinite(sigma) else ("unknown", "", "up"))
-    for key, unit_, name, text in (
-        ("fps", "", "frames per second", "{:.1f}"),
-        ("cpu_ms_per_frame", "ms", "CPU per frame", "{:.0f}"),
-        ("peak_rss_mb", "MB", "memory", "{:.0f}"),
-    ):
-        if math.isfinite(value := number(summary.get(key))):
-            out.append((text.format(value), unit_, name))
-    return [{"value": value, "unit": unit_, "label": label} for value, unit_, label in out]
+    scale, counts = record(summary.get("scale")), record(summary.get("map"))
+    sigma = number(scale.get("sigma")) / (number(scale.get("value")) or math.nan)
+    judged_map = score.map if score is not None else None
+    return [
+        ("position error (ATE, Sim(3))", 100 * score.ate_sim3_m if score else math.nan, 2, "cm"),
+        (
+            "position error without scaling (SE(3))",
+            100 * score.ate_se3_m if score and score.units == "metres" else math.nan,
+            2,
+            "cm",
+        ),
+        ("rotation error", score.rotation_deg if score else math.nan, 2, "\u00b0"),
+        ("map error (median)", 100 * judged_map.median_m if judged_map else math.nan, 2, "cm"),
+        ("frames", frames or len(run.trajectory), 0, ""),
+        ("frames tracked", 100.0 * run.trusted_frames / frames if frames and run.status else math.nan, 1, "%"),
+        ("times lost", number(summary.get("lost_events")), 0, ""),
+        ("scale, 1 sigma", 100 * sigma if scale.get("units") == "metres" else math.nan, 1, "%"),
+        ("up, 1 sigma", number(record(summary.get("up")).get("sigma_deg")), 1, "\u00b0"),
+        ("length of the path", _path_length(run), 2, unit(run)),
+        ("keyframes", number(counts.get("keyframes")), 0, ""),
+        ("anchors", number(counts.get("anchors")), 0, ""),
+        ("edge points", number(counts.get("edge_points")), 0, ""),
+        ("frames per second", number(summary.get("fps")), 1, ""),
+        ("CPU per frame", number(summary.get("cpu_ms_per_frame")), 1, "ms"),
+        ("memory", number(summary.get("peak_rss_mb")), 0, "MB"),
+    ]
+
+
+def tiles(run: RunFolder, score: RunScore | None) -> list[dict[str, str]]:
+    """Key figures at the top of the page; of scale and vertical also that they are not known."""
+    out = []
+    for name, value, digits, unit_ in figures(run, score):
+        what, stated, _ = name.partition(", 1 sigma")
+        if name in _ON_TILES and math.isfinite(value):
+            sign = "\u00b1" if stated else ""
+            out.append((f"{sign}{value:.{digits}f}", unit_, name))
+        elif stated and record(run.summary.get(what)):
+            out.append(("unknown", "", what))
+    return [{"value": value, "unit": unit_, "label": name} for value, unit_, name in out]
 
 
 def foot(run: RunFolder) -> str:
@@ -248,6 +280,10 @@ def _flat(value: object) -> str:
     if isinstance(value, list):
         return "; ".join(_flat(item) for item in value) or "none"
     return ", ".join(f"{key} {item}" for key, item in value.items()) if isinstance(value, dict) else str(value)
+
+
+def _path_length(run: RunFolder) -> float:
+    return float(np.linalg.norm(np.diff(run.trajectory.positions, axis=0), axis=1).sum())
 
 
 def _offered(run: RunFolder) -> int:

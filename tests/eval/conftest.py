@@ -12,7 +12,7 @@ from edgeslam_torch.types import PointCloud
 from edgeslam_torch.writers.ply import write_ply
 
 COLUMNS = (
-    "index stamp status reason matches inliers parallax_deg keyframe scale scale_sigma scale_source "
+    "index stamp_s status reason matches inliers parallax_deg keyframe scale scale_sigma scale_source "
     "features_ms track_ms"
 )
 

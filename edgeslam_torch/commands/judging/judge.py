@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Run the missing cells, print and write the table; 1 when a cell has no result."""
     from edgeslam_torch.eval.judge.cells import list_cells
-    from edgeslam_torch.eval.judge.release import command_outputs, last_cost, release_cells, release_record
+    from edgeslam_torch.eval.judge.release import command_outputs, release_cells, release_record
     from edgeslam_torch.eval.judge.runner import RECORD, JudgeSettings, judge, read_record
     from edgeslam_torch.eval.judge.table import markdown, markdown_against
     from edgeslam_torch.eval.judge.thresholds import THRESHOLDS, read_thresholds
@@ -68,7 +68,7 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError("--release runs its own cells with default settings: omit --only, --set and --max-frames")
     if args.release is not None:
         cells = release_cells(data)
-        say(f"release: {len(cells)} runs{last_cost(args.release)}; call it again to go on where it was interrupted")
+        say(f"release: {len(cells)} runs; call it again to go on where it was interrupted")
     else:
         cells = list_cells(data, args.cells, range(args.first_seed, args.first_seed + args.seeds), args.only)
     settings = JudgeSettings(tuple(args.set), args.max_frames, args.jobs, args.timeout, args.flights)

@@ -80,7 +80,7 @@ def test_no_reason_or_setting_breaks_the_page(run):
     plain = Page(write_report(run))
     for name in NAMES[:5]:
         (run / "config.toml").write_text(name)
-        (run / "status.csv").write_text(f'stamp,status,reason\n100.0,lost,"{name}"\n')
+        (run / "status.csv").write_text(f'stamp_s,status,reason\n100.0,lost,"{name}"\n')
         page = Page(write_report(run))
         assert page.tags == plain.tags
         assert page.data["config"] == name
@@ -143,7 +143,7 @@ def test_page_tells_nothing_about_the_disk(run):
         problems=[{"file": f"{secret}/kitchen/1.png", "reason": "cannot be read"}],
     )
     (run / "config.toml").write_text(f'[depth]\nweights = "{secret}/weights.safetensors"\n')
-    (run / "status.csv").write_text(f"stamp,status,reason\n100.0,lost,{secret}/kitchen/1.png: dark\n")
+    (run / "status.csv").write_text(f"stamp_s,status,reason\n100.0,lost,{secret}/kitchen/1.png: dark\n")
     page = write_report(run).read_text(encoding="utf-8")
     assert "Jane" not in page and "projects" not in page
     for kept in ("camera.yaml", "telemetry.csv: no sample", "1.png, reason cannot", "weights.safetensors", "kitchen"):
