@@ -1,7 +1,4 @@
-"""The figures of one run.
-
-A figure is added by a function in `METRICS`, and a line in the columns of `edgeslam_torch.eval.judge.table`.
-"""
+"""The figures of one run: a new one is a function in `METRICS`, and a line in `COLUMNS` that shows and compares it."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.experiment.figures import Figure
 from edgeslam_torch.eval.inputs.associate import match
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, open_run
@@ -182,6 +180,44 @@ METRICS: tuple[Callable[[Judged], Mapping[str, Any]], ...] = (
     _map,
 )
 """Figures of a run with ground truth."""
+
+
+COLUMNS = (
+    Figure("frames", "frames", "{:.0f}"),
+    Figure("supported_end", "end %", "{:.1f}", 100.0, floor=0.005, relative=False, lower_is_better=False),
+    Figure(
+        "supported_live", "live %", "{:.1f}", 100.0, floor=0.005, one_seed=0.01, relative=False, lower_is_better=False
+    ),
+    Figure("losses", "lost", "{:.0f}", floor=0.5, relative=False),
+    Figure("pieces", "pieces", "{:.0f}"),
+    Figure("ate_m", "ATE", spread=True, floor=0.03, one_seed=0.05),
+    Figure("online_m", "online", spread=True, floor=0.03, one_seed=0.16),
+    Figure("ate_percent", "path %", "{:.2f}"),
+    Figure("return_percent", "return %", "{:.2f}"),
+    Figure("rotation_deg", "rot °", "{:.2f}", floor=0.03, one_seed=0.28),
+    Figure("scale", "scale", "{:.3f}"),
+    Figure("scale_sigma", "sigma %", "{:.1f}", 100.0),
+    Figure("scale_z", "z", "{:+.1f}"),
+    Figure("first_scale_s", "1st scale s", "{:.1f}"),
+    Figure("first_scale_sigmas", "its z", "{:.1f}"),
+    Figure("beyond_3_sigma", ">3 sigma %", "{:.0f}", 100.0),
+    Figure("se3_m", "SE(3)"),
+    Figure("still_m", "still", "{:.3f}"),
+    Figure("first_m", "1st s"),
+    Figure("first_over_rest", "x rest", "{:.1f}"),
+    Figure("map_points", "points", "{:.0f}", floor=0.05, lower_is_better=False),
+    Figure("map_median_m", "median cm", "{:.2f}", 100.0, floor=0.03, one_seed=0.80),
+    Figure(
+        "map_within_5cm", "5 cm %", "{:.0f}", 100.0, floor=0.02, one_seed=0.08, relative=False, lower_is_better=False
+    ),
+    Figure("map_within_10cm", "10 cm %", "{:.0f}", 100.0),
+    Figure("cpu_ms", "CPU ms", "{:.1f}", floor=0.10),
+    Figure("cpu_orb", "CPU ORB", "{:.1f}"),
+    Figure("wall_s", "wall s", "{:.1f}"),
+    Figure("memory_mb", "MB", "{:.0f}"),
+)
+"""Floors for one seed are two standard deviations of a difference of two runs, measured with three seeds on two
+recordings (tum_fr1_xyz, 7scenes_redkitchen); recordings with tracking losses scatter more."""
 
 
 def _standing_still(run: RunFolder, truth: Truth) -> dict[str, Any]:

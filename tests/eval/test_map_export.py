@@ -248,21 +248,14 @@ def test_unknown_units_are_said(scale, run_folder, tmp_path, capsys):
     assert "the folder does not say" in capsys.readouterr().out
 
 
-def test_empty_map_is_said(run_folder, tmp_path):
-    run_folder(tmp_path / "a")
-    empty = np.zeros((0, 3), np.float32)
-    write_ply(
-        tmp_path / "a" / "edge_map.ply",
-        PointCloud(empty, empty.astype(np.uint8), empty[:, 0], empty[:, 0].astype(np.int32)),
-    )
-    with pytest.raises(EdgeSlamError, match="edge map is empty"):
-        export(tmp_path / "a", "--format", "occupancy")
-
-
-def test_nothing_left_is_said(run_folder, tmp_path):
-    run_folder(tmp_path / "a")
-    with pytest.raises(EdgeSlamError, match="no point is left"):
-        export(tmp_path / "a", "--format", "ply", "--max-sigma", 1e-9)
+@pytest.mark.parametrize(
+    ("points", "words", "said"),
+    [(0, ("occupancy",), "edge map is empty"), (2000, ("ply", "--max-sigma", 1e-9), "no point is left")],
+)
+def test_nothing_to_write_is_said(points, words, said, run_folder, tmp_path):
+    run_folder(tmp_path / "a", points=points)
+    with pytest.raises(EdgeSlamError, match=said):
+        export(tmp_path / "a", "--format", *words)
 
 
 KNOWN = {"source": "edges", "sigma_deg": 1.24}
@@ -271,10 +264,8 @@ KNOWN = {"source": "edges", "sigma_deg": 1.24}
 @pytest.mark.parametrize(
     ("form", "file", "up"),
     [
-        *[(*form, KNOWN) for form in (("ply", ""), ("pcd", ""), ("las", ""), ("colmap", "points3D.txt"))],
-        *[(*form, None) for form in (("pcd", ""), ("las", ""), ("colmap", "images.txt"))],
-        *[("ply", "", up) for up in ({"source": "unknown", "sigma_deg": None}, [KNOWN], {"source": "edges"})],
-        ("ply", "", {"source": 3, "sigma_deg": "x"}),
+        *[(*form, up) for form in (("pcd", ""), ("las", ""), ("colmap", "points3D.txt")) for up in (KNOWN, None)],
+        *[("ply", "", up) for up in (KNOWN, {"source": "unknown", "sigma_deg": None}, {"source": 3, "sigma_deg": "x"})],
     ],
 )
 def test_every_exported_map_says_whether_z_is_up(run_folder, tmp_path, capsys, form, file, up):

@@ -4,7 +4,8 @@ import pytest
 from markdown_rows import row as cells_of
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.judge.table import COLUMNS, markdown, markdown_against
+from edgeslam_torch.eval.judge.score import COLUMNS
+from edgeslam_torch.eval.judge.table import markdown, markdown_against
 from edgeslam_torch.eval.judge.thresholds import read_thresholds, verdicts_of_cell, verdicts_of_groups
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import associate, match
 from edgeslam_torch.eval.inputs.clocks import on_one_clock
-from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory, write_tum
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.eval.metrics.align import AlignmentKind, umeyama
 from edgeslam_torch.eval.metrics.diagnose import explain
 from edgeslam_torch.eval.metrics.trajectory_error import score_trajectory
@@ -198,9 +198,7 @@ def findings(truth, estimate, kind="sim3", **options):
 
 
 def noisy(loop, rng):
-    T = loop.T_w_c.copy()
-    T[:, :3, 3] += rng.normal(0.0, 0.004, (len(T), 3))
-    return replace(loop, T_w_c=T)
+    return at(loop, loop.positions + rng.normal(0.0, 0.004, (len(loop), 3)))
 
 
 def test_a_good_trajectory_gets_no_findings(loop, rng):
@@ -214,28 +212,26 @@ WORLD = se3.exp(np.array([4.0, -2.0, 1.0, 0.4, -0.9, 1.3]))
 def w_first(trajectory):
     """Its file, with the scalar part written first and read as if it came last."""
     q = Rotation.from_matrix(trajectory.T_w_c[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    return turned(trajectory, Rotation.from_quat(q).as_matrix())
+
+
+def turned(trajectory, R):
     T = trajectory.T_w_c.copy()
-    T[:, :3, :3] = Rotation.from_quat(q).as_matrix()
+    T[:, :3, :3] = R
     return replace(trajectory, T_w_c=T)
 
 
-def inverted_rotations(trajectory):
+def at(trajectory, positions):
     T = trajectory.T_w_c.copy()
-    T[:, :3, :3] = np.swapaxes(T[:, :3, :3], 1, 2)
-    return replace(trajectory, T_w_c=T)
-
-
-def in_centimetres(trajectory):
-    T = trajectory.T_w_c.copy()
-    T[:, :3, 3] *= 100.0
+    T[:, :3, 3] = positions
     return replace(trajectory, T_w_c=T)
 
 
 MISTAKES = {
     "world-to-camera": lambda t: replace(t, T_w_c=se3.inverse(t.T_w_c)),
     "qw qx qy qz": w_first,
-    "look inverted": inverted_rotations,
-    "centimetres": in_centimetres,
+    "look inverted": lambda t: turned(t, np.swapaxes(t.T_w_c[:, :3, :3], 1, 2)),
+    "centimetres": lambda t: at(t, 100.0 * t.positions),
 }
 
 
@@ -259,9 +255,7 @@ def test_nobody_is_blamed_where_both_could_be_wrong(mistake, loop, rng):
 @pytest.mark.parametrize("whose", ["the ground truth", "the estimate"])
 def test_figures_that_need_orientations_are_left_out_without(whose, alone, loop, rng):
     files = {"the ground truth": loop, "the estimate": noisy(loop, rng)}
-    T = files[whose].T_w_c.copy()
-    T[:, :3, :3] = np.eye(3)
-    files[whose] = replace(files[whose], T_w_c=T, oriented=not alone)
+    files[whose] = replace(turned(files[whose], np.eye(3)), oriented=not alone)
     score = score_trajectory(*files.values())
     assert score.ate_m.rmse < 0.01
     assert np.isnan(score.rotation_deg.rmse) and np.isnan(score.full_transform.rmse)
@@ -271,20 +265,15 @@ def test_figures_that_need_orientations_are_left_out_without(whose, alone, loop,
 
 
 def test_a_camera_that_only_shifts_has_orientations(loop, rng):
-    T = loop.T_w_c.copy()
-    T[:, :3, :3] = np.eye(3)
-    truth, estimate = replace(loop, T_w_c=T), noisy(loop, rng)
-    E = estimate.T_w_c.copy()
-    E[:, :3, :3] = Rotation.from_rotvec(rng.normal(0.0, 0.003, (len(E), 3))).as_matrix()
-    assert score_trajectory(truth, replace(estimate, T_w_c=E)).rotation_deg.rmse < 2.0
+    jitter = Rotation.from_rotvec(rng.normal(0.0, 0.003, (len(loop), 3))).as_matrix()
+    assert score_trajectory(turned(loop, np.eye(3)), turned(noisy(loop, rng), jitter)).rotation_deg.rmse < 2.0
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 2e-4])
 def test_a_truth_that_never_moves_is_refused(noise_m, loop, rng):
-    T = loop.T_w_c.copy()
-    T[:, :3, 3] = [3.0, 2.0, 1.0] + noise_m * rng.normal(size=(len(T), 3))
+    still = at(replace(loop, source="gt.txt"), [3.0, 2.0, 1.0] + noise_m * rng.normal(size=(len(loop), 3)))
     with pytest.raises(EvaluationError, match=r"gt.txt: .*never moves"):
-        score_trajectory(replace(loop, T_w_c=T, source="gt.txt"), loop)
+        score_trajectory(still, loop)
 
 
 def test_a_score_of_hardly_any_pairs_is_refused(loop):
@@ -299,12 +288,6 @@ def test_late_stamps_are_measured(loop, rng):
     text = findings(loop, replace(estimate, stamps_s=estimate.stamps_s + 1.37))
     found = re.search(r"--offset (-[\d.]+)", text)
     assert found is not None and float(found.group(1)) == pytest.approx(-1.37, abs=0.025)  # half a frame
-
-
-def at(trajectory, positions):
-    T = trajectory.T_w_c.copy()
-    T[:, :3, 3] = positions
-    return replace(trajectory, T_w_c=T)
 
 
 def walked(trajectory):
@@ -334,19 +317,12 @@ def test_a_mistake_is_recognised_for_what_it_is(change, said, unsaid, loop, rng)
     assert said in text and unsaid not in text
 
 
-def test_orientations_that_hardly_turn_are_judged_by_their_angle_to_the_truth(loop, rng, tmp_path):
+def test_orientations_that_hardly_turn_are_judged_by_their_angle_to_the_truth(loop, rng):
     """A recording like fr1_xyz looks one way: a wrong order of the quaternion spreads little, but is far off."""
     estimate = noisy(loop, rng).take(slice(0, 20))
-    swapped = np.swapaxes(estimate.T_w_c[:, :3, :3], 1, 2)
-    T = estimate.T_w_c.copy()
-    T[:, :3, :3] = swapped
-    assert "inverted" in findings(loop, replace(estimate, T_w_c=T))
-    write_tum(estimate, tmp_path / "t.txt")
-    rows = np.loadtxt(tmp_path / "t.txt")
-    np.savetxt(tmp_path / "wxyz.txt", rows[:, [0, 1, 2, 3, 7, 4, 5, 6]])
-    assert "qw qx qy qz" in findings(loop, read_trajectory(tmp_path / "wxyz.txt"))
-    T[:, :3, :3] = np.eye(3)
-    assert "left out" in findings(loop, replace(estimate, T_w_c=T))
+    for mistake in ("look inverted", "qw qx qy qz"):
+        assert mistake in findings(loop, MISTAKES[mistake](estimate))
+    assert "left out" in findings(loop, turned(estimate, np.eye(3)))
 
 
 @pytest.mark.parametrize("factor", [1.0, 1e3, 1e9], ids=["s", "ms", "ns"])
@@ -369,10 +345,9 @@ def test_no_offset_is_offered_for_another_shape(loop):
 
 
 def test_monocular_run_judged_without_scale_is_warned_about(loop, rng):
-    T = noisy(loop, rng).T_w_c
-    T[:, :3, 3] *= 0.4
-    assert "without scale" in findings(loop, replace(loop, T_w_c=T), "se3")
-    assert "without scale" not in findings(loop, replace(loop, T_w_c=T), "sim3")
+    small = at(loop, 0.4 * noisy(loop, rng).positions)
+    assert "without scale" in findings(loop, small, "se3")
+    assert "without scale" not in findings(loop, small, "sim3")
 
 
 def test_one_pose_and_a_standing_camera_are_refused(loop):

@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from browser import PROGRAM, Browser
 
@@ -12,23 +11,6 @@ from edgeslam_torch.eval.report.page import write_report
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no chromium here: the report page is not opened")
 
 PROBE = Path(__file__).with_name("report_probe.js")
-
-TURN = """new Promise(done => {
-  const gaps = []; let last = 0;
-  const step = now => {
-    if (last) gaps.push(now - last);
-    last = now; viewer.turn(4, 0);
-    gaps.length < 90 ? requestAnimationFrame(step) : done({ gaps, points: viewer.budget });
-  };
-  requestAnimationFrame(step);
-})"""
-
-REST = """new Promise(done => {
-  const begin = performance.now();
-  const look = () => viewer.dirty || viewer.moving || viewer.drawn < viewer.total() ?
-    requestAnimationFrame(look) : done(performance.now() - begin);
-  look();
-})"""
 
 
 @pytest.fixture(scope="module")
@@ -110,24 +92,3 @@ def test_no_text_of_a_run_makes_the_page_scroll_sideways(worst_page, browser, wi
     browser.run("[0.01, 0.5, 0.99].forEach(t => moveCursor(t * DATA.time[1], byId('inliers')))")
     assert browser.run("document.documentElement.scrollWidth") == width
     assert browser.errors == []
-
-
-@pytest.mark.slow
-@pytest.mark.alone
-def test_largest_map_is_turned_in_short_frames(run_folder, tmp_path):
-    """Prints what is asked for: milliseconds a frame with 200 000 points, drawn by the processor alone."""
-    page = write_report(tmp_path / "run", run_folder(tmp_path / "run", points=200_000))
-    assert page.stat().st_size < 15e6
-    for name, size in (("desktop", (1280, 900, 1.0, False)), ("phone", (390, 844, 3.0, True))):
-        with Browser(tmp_path / name) as browser:
-            browser.open(page, *size)
-            browser.run(REST)
-            turned, rest_ms = browser.run(TURN), browser.run(REST)
-            assert browser.errors == []
-            drawn = browser.run("[viewer.drawn, viewer.total()]")
-        assert drawn[0] >= drawn[1] >= 199_000, "at rest everything is there"
-        gaps = np.array(turned["gaps"])
-        print(
-            f"\n{name}, 200 000 points, no graphics card: {np.median(gaps):.0f} ms per frame while turned, 95 % within "
-            f"{np.quantile(gaps, 0.95):.0f} ms, {turned['points']} points each; all of them {rest_ms:.0f} ms after"
-        )
