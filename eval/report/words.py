@@ -164,7 +164,7 @@ def tiles(run: RunFolder, score: RunScore | None) -> list[dict[str, str]]:
         what, stated, _ = name.partition(", 1 sigma")
         if name in _ON_TILES and math.isfinite(value):
             sign = "\u00b1" if stated else ""
-            out.append((f"{sign}{value:.{digits}f}", unit_, name))
+            out.append((f"{sign}{value:,.{digits}f}".replace(",", "\u2009"), unit_, name))
         elif stated and record(run.summary.get(what)):
             out.append(("unknown", "", what))
     return [{"value": value, "unit": unit_, "label": name} for value, unit_, name in out]
