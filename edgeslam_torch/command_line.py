@@ -23,7 +23,7 @@ Commands = Mapping[str, tuple[str, str]]
 
 EXIT_ERROR = 1
 _MOST_SHOWN = 2000
-"""Characters of an error; a name of five thousand is none that anybody reads."""
+"""Maximum length of an error message [characters]: names in hostile files may be arbitrarily long."""
 
 
 def run_command(arguments: list[str], commands: Commands) -> int:

@@ -248,8 +248,7 @@ class FrameStatus(StrEnum):
     """How a frame got its pose."""
 
     STARTING = "starting"
-    """Begins a piece of map, or is tracked on its guessed depths: nothing is triangulated yet that could contradict
-    them."""
+    """Begins a submap, or is tracked on its predicted depths: no triangulated anchor can contradict them yet."""
     INITIALISED = "initialised"
     """The frame with enough parallax to create the map."""
     TRACKED = "tracked"

@@ -111,7 +111,7 @@ class LogSlope(nn.Module):
     The slope is that of the line of least squares through the valid pixels of an image. Scale does not count.
 
     Args:
-        floor: Variance [log m squared] below which an image has no range to speak of: it pulls the slope to 1.
+        floor: Variance [log m squared] below which depth counts as constant: it regularises the slope towards 1.
     """
 
     def __init__(self, floor: float = 0.01) -> None:

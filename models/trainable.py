@@ -1,4 +1,4 @@
-"""What training and export ask of a network; FastDepth is one, and your own may be another."""
+"""What training and export require of a network; FastDepth is one, and your own may be another."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -53,7 +53,7 @@ class DepthModule(nn.Module):
         return Prediction(F.avg_pool2d(log_depth, 2), None if log_sigma is None else F.avg_pool2d(log_sigma, 2))
 
     def encoder(self) -> Sequence[nn.Module]:
-        """Stages that know something already, from the image on: the first are frozen, the others learn at the
+        """Pretrained stages, from the image on: the first are frozen, the others learn at the
         encoder's rate, and their norms keep their statistics. None by default."""
         return ()
 

@@ -70,7 +70,7 @@ class SupervisedWeights:
 
 
 class SupervisedTerms:
-    """What labels ask of a prediction."""
+    """Losses of a prediction against labels."""
 
     def __init__(self, weights: SupervisedWeights) -> None:
         self._weights = asdict(weights)

@@ -116,7 +116,7 @@ class SubmapGraph:
             return
         if before not in self.starts:
             self.first_scale = self.scale_now()
-        earlier_t, earlier_r = self.apart(before, self.first, keyframe.centre_w)
+        earlier_t, earlier_r = self.uncertainty(before, self.first, keyframe.centre_w)
         sigma = math.hypot(sigma_t, earlier_t), math.hypot(sigma_r_rad, earlier_r)
         self.starts[piece] = _Start(keyframe.id, *sigma)
 
@@ -145,7 +145,7 @@ class SubmapGraph:
 
     # -- marginals ---------------------------------------------------------------------------------------------
 
-    def apart(self, piece: int, other: int, centre: FloatArray) -> tuple[float, float]:
+    def uncertainty(self, piece: int, other: int, centre: FloatArray) -> tuple[float, float]:
         """Standard deviations per axis [map units, rad] of a camera ``(3,)`` of one submap as seen from another, by
         the sensors' links; infinite if unrelated, as submaps of earlier flights.
 
@@ -176,7 +176,7 @@ class SubmapGraph:
         one_map = mine == theirs
         if not one_map and BEFORE_S in (one.stamp_s, other.stamp_s):
             return None
-        sigma_t, sigma_r = self.apart(mine, theirs, one.centre_w)
+        sigma_t, sigma_r = self.uncertainty(mine, theirs, one.centre_w)
         if not math.isfinite(sigma_t):
             return None
         drift, steps = self._drift(one, other)
@@ -199,8 +199,8 @@ class SubmapGraph:
         members = [k for _, k in sorted(self.map.keyframes.items())]
         row_of = {k.id: row for row, k in enumerate(members)}
         oldest = min(self.map.piece_of(one.id), self.map.piece_of(other.id))
-        held = SENSOR_DRIFT if self.metres(oldest) is not None else DRIFT
-        share = np.array([held if self.map.piece_of(k.id) == oldest else DRIFT for k in members])
+        drift_share = SENSOR_DRIFT if self.metres(oldest) is not None else DRIFT
+        share = np.array([drift_share if self.map.piece_of(k.id) == oldest else DRIFT for k in members])
         centre = np.stack([k.centre_w for k in members])
         i, j = np.array(list(shared_anchors(self.map, members)), dtype=np.int64).reshape(-1, 2).T
         edge = np.linalg.norm(centre[i] - centre[j], axis=1) * share[i] + _MIN_DISTANCE

@@ -20,14 +20,15 @@ _ASPECT_TOLERANCE = 0.005
 """Relative; KITTI's 1241x376 halved is off by 0.001, 4:3 and 16:9 differ by 0.33."""
 
 _PLAIN_SCALES = (2.0, 0.5, 3.0, 1.0 / 3.0, 1.5, 2.0 / 3.0, 4.0, 0.25)
-"""Sizes of the images that a calibration was made for, relative to the images', that its principal point betrays."""
+"""Ratios of the size that a calibration was made for to the images'; a principal point at the centre of such a size
+is evidence for it."""
 _SCALE_TOLERANCE = 0.2
 """Relative to the difference from 1; principal points of real cameras lie within a tenth of the middle (EuRoC's cam0:
 0.04)."""
 _MAX_OFF_MIDDLE = 0.5
 """Relative to half the width or height."""
 _MAX_PIXEL_ASPECT = 1.1
-"""Maximum ratio of the focal lengths without a word; digitised PAL video has 1.07, anamorphic video 1.33."""
+"""Maximum ratio of the focal lengths without a warning; digitised PAL video has 1.07, anamorphic video 1.33."""
 
 TELLO_SIZES = ((960, 720), (648, 478))
 """Resolutions of its video, high and low."""

@@ -147,7 +147,7 @@ def _fetched(archive: Archive, downloads: Path, progress: Callable[[str], Progre
 
 @contextmanager
 def _remembered_if_good(archive: Archive, downloads: Path, origin: Origin, given: Path | None) -> Iterator[None]:
-    """Remember an archive's checksum once its content proves to be what it should; else forget what came.
+    """Store an archive's checksum once its content is verified; otherwise remove the download.
 
     An error page, or half a file, must not be what the next download has to match.
     """

@@ -59,7 +59,7 @@ def run_and_judge(
 
     Raises:
         OutputError: If the folder cannot be written to.
-        EvaluationError: If there is no trajectory to speak of (the run was interrupted at once).
+        EvaluationError: If the trajectory is too short to compare (the run was interrupted at once).
     """
     result = run(open_source(str(recorded.folder)), Path(out), config, listeners=listeners)
     score = evaluate_run(out, recorded.folder, judge_map=False)

@@ -606,14 +606,14 @@ class Tello:
         return max(newest.stamp_s if newest is not None else 0.0, self._video_begin_s)
 
     def _missing(self, now: float) -> list[str]:
-        """What to ask for of what came before and no longer comes."""
+        """Commands that restart state messages or video that have stopped."""
         if self.latest is None:
             return []
         words = ["command"] if now - self.latest.stamp_s > _QUIET_S else []
         return [*words, "streamon"] if now - self._pictured_s() > _QUIET_S else words
 
     def _ask(self, missing: list[str]) -> None:
-        """Enter SDK mode again and ask for video again, which a drone that flies on takes without harm."""
+        """Enter SDK mode and request video again; harmless for a drone in flight."""
         if not self._sending.acquire(blocking=False):
             return
         try:

@@ -16,7 +16,7 @@ from edgeslam_torch.types import FloatArray
 
 REACH_S = 5.0
 """Time over which heights are compared with the map."""
-_CARRIED_S = 1.0
+_INTEGRATED_S = 1.0
 """Time over which velocities are integrated; quantisation of 0.1 m/s adds up to as many metres per second."""
 _NOISE_M = 0.05
 """Three standard deviations of a range reading, and of a tracked position."""
@@ -50,7 +50,7 @@ def reckoned(model: TelemetryModel, recent: Sightings, stamp_s: float) -> Reckon
     late_s = math.hypot(model.delay_sigma_s, STAMP_S)
     frame_s = stamp_s - model.delay_s + np.array([0.0, -late_s, late_s])
     stamps_s = recent.stamps_s - model.delay_s
-    late = stamps_s >= stamps_s.max() - _CARRIED_S
+    late = stamps_s >= stamps_s.max() - _INTEGRATED_S
     if not model.track.covered(stamps_s[late].min()[None], frame_s[2:])[0]:
         return None
     moments_s = np.concatenate([stamps_s, frame_s])

@@ -72,20 +72,20 @@ class TelemetryModel:
     """Probability that velocities are truncated, not rounded."""
     attitude: bool = True
     """Whether attitude is usable."""
-    young: bool = False
+    new_map: bool = False
     """Whether the map is only seconds old."""
     gain_sigma: tuple[float, ...] = (0.0, 0.0, 0.0)
     """Relative standard deviation of each velocity column, beyond that of the scale."""
 
     @property
-    def knows_metres(self) -> bool:
+    def metric(self) -> bool:
         """Whether the metric scale is known."""
         return math.isfinite(self.scale_sigma_log)
 
     @property
     def holds_level(self) -> bool:
         """Whether attitude constrains the frames: the map still rests on predicted depths."""
-        return self.young and not self.knows_metres
+        return self.new_map and not self.metric
 
     def positions(
         self, stamps_s: FloatArray, p_m: FloatArray, scale_sigma_log: float | None = None
@@ -119,12 +119,12 @@ class TelemetryModel:
         if len(self.track) < 2 or not (self.attitude and self.track.has_attitude):
             return None
         # Without parallax half a degree of lean looks like motion, and depths diverge.
-        steady = not self.knows_metres
+        steady = not self.metric
         return up_directions(self.track, stamps_s - self.delay_s, self.T_b_c[:3, :3], self.R_w_m, steady)
 
     def headings(self, stamps_s: FloatArray) -> Headings | None:
         """Headings of frames at increasing ``stamps_s`` ``(K,)``; None for fewer than two, or without metric scale."""
-        if not (self.knows_metres and self.attitude and self.track.has_attitude):
+        if not (self.metric and self.attitude and self.track.has_attitude):
             return None
         return headings(self.track, stamps_s - self.delay_s, self.T_b_c[:3, :3], self.R_w_m, self.delay_sigma_s)
 

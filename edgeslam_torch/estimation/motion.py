@@ -224,8 +224,8 @@ class MotionFusion:
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
         """As `Orientation.vertical`; None if the map did not begin upright, or has a metric scale: attitude in whole
         degrees is worse than a map with parallax."""
-        asked = self.metres.sensor_scale is None and self.orientation.began_upright
-        return self.orientation.vertical(stamp_s) if asked else None
+        usable = self.metres.sensor_scale is None and self.orientation.began_upright
+        return self.orientation.vertical(stamp_s) if usable else None
 
     def attitude_and_position(self, stamp_s: float) -> tuple[tuple[FloatArray, float] | None, Reckoned | None]:
         """Results of `Orientation.turned` and `reckoned` for a frame."""
@@ -311,8 +311,8 @@ class MotionFusion:
         last = self._memory.last
         if last is None:
             return None
-        held = self._filter.frozen(), self.imu.frozen()
-        return Snapshot(last, self._memory.previous, *held, self.scale(), self.flight.delay_sigma_s)
+        frozen = self._filter.frozen(), self.imu.frozen()
+        return Snapshot(last, self._memory.previous, *frozen, self.scale(), self.flight.delay_sigma_s)
 
     def statistics(self) -> dict[str, float]:
         """Counters and the state of the estimates, for the report."""

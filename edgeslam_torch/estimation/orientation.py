@@ -8,7 +8,7 @@ from edgeslam_torch.estimation.remembered import Remembered
 from edgeslam_torch.estimation.scale.camera_mount import Turned, mount_by_turns
 from edgeslam_torch.estimation.sensors.attitude import is_steady
 from edgeslam_torch.estimation.telemetry.alignment import LATELY, attitudes, map_to_world
-from edgeslam_torch.estimation.telemetry.comparison import MOST_APART_RAD
+from edgeslam_torch.estimation.telemetry.comparison import MAX_DEVIATION_RAD
 from edgeslam_torch.geometry.rotations import rotation_vector
 from edgeslam_torch.noise import DELAY_S, STAMP_S
 from edgeslam_torch.types import FloatArray
@@ -74,11 +74,13 @@ class Orientation:
     def has_diverged(self) -> bool:
         """Whether a validated attitude has begun to disagree with the images."""
         flight, found = self._flight, self.found
-        asked = found is not None and flight.trust.turns and math.isfinite(flight.delay_sigma_s)
-        pairs = attitudes(flight.memory.newest(LATELY), flight.track, flight.delay_s) if asked else None
+        usable = found is not None and flight.trust.turns and math.isfinite(flight.delay_sigma_s)
+        pairs = attitudes(flight.memory.newest(LATELY), flight.track, flight.delay_s) if usable else None
         if pairs is None or found is None:
             return False
-        return float(np.linalg.norm(rotation_vector(pairs.map_to_world(found.R_b_c) @ found.R_w_m.T))) > MOST_APART_RAD
+        return (
+            float(np.linalg.norm(rotation_vector(pairs.map_to_world(found.R_b_c) @ found.R_w_m.T))) > MAX_DEVIATION_RAD
+        )
 
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
         """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and its maximum error [rad] due to the

@@ -103,7 +103,7 @@ class ScaleEstimator:
 
     @property
     def decided(self) -> Decision:
-        """Which sources are used; cached, since it is asked several times a frame."""
+        """Which sources are used; cached, since it is read several times a frame."""
         depth = self._depth.scale()
         beliefs = [self._with_focal(b, _FOCAL_SHARE) for b in self._by_telemetry.values()]
         # An earlier flight's scale includes the network's; beside an IMU neither says anything.

@@ -56,7 +56,7 @@ _UNDITHERED = 0.05
 """Residual error of the remainders [steps]. With 0.2 to 0.3 steps of noise before rounding, the mean reading is off by
 0.15 to 0.05 steps with a sign that varies with speed; averaging over speeds leaves about two thirds."""
 _UNPROVEN = 15.0
-"""Number of intervals up to which residuals hardly tell rounding modes apart: at similar speeds quantisation errors
+"""Number of intervals up to which residuals hardly distinguish rounding modes: at similar speeds quantisation errors
 repeat, and the map's own errors may look like either."""
 _GOOD_HEIGHT = 0.2
 """Relative sigma at which the search stops: the remaining height sources observe the same motion less accurately."""
@@ -138,7 +138,7 @@ class TelemetryScale:
         trust: Which readings are usable.
         delay_s: Video delay behind telemetry.
         turned: Rotation of the map relative to the power-on world.
-        held: Previous scale [metres per map unit].
+        previous: Previous scale [metres per map unit].
         flying: Estimate the present scale of a drifting map; otherwise one scale for the whole map.
     """
 
@@ -150,12 +150,12 @@ class TelemetryScale:
         trust: SensorGate,
         delay_s: float,
         turned: Turned,
-        held: float | None,
+        previous: float | None,
         flying: bool = False,
     ) -> None:
         self._config, self._T_b_c = config, T_b_c
         self._present, self._trust = present, trust
-        self._delay_s, self._held = delay_s, held
+        self._delay_s, self._previous = delay_s, previous
         self._R_w_m, self._tilt_rad = turned.R_w_m, turned.sigma_rad
         self._flying = flying
         self._shown = self._compared() if trust.velocity else None
@@ -285,8 +285,8 @@ class TelemetryScale:
 
     def _moving(self, moved: Displacements, moved_m: FloatArray) -> np.ndarray:
         """Mask of intervals above the minimum speed, measured by vision once the scale is roughly known."""
-        if self._held is not None:
-            speed = np.linalg.norm(moved.moved, axis=1) * self._held / moved.duration_s
+        if self._previous is not None:
+            speed = np.linalg.norm(moved.moved, axis=1) * self._previous / moved.duration_s
         else:
             speed = np.linalg.norm(moved_m, axis=1) / moved.duration_s
         return speed > self._config.min_speed_m_s

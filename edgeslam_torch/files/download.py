@@ -111,7 +111,7 @@ def _answer(request: urllib.request.Request) -> Any:
 
 
 def discard(part: Path) -> None:
-    """Forget a partial file."""
+    """Remove a partial file."""
     part.unlink(missing_ok=True)
     _tag_file(part).unlink(missing_ok=True)
 

@@ -105,8 +105,8 @@ def _bend(anchor_uv: FloatArray, error: FloatArray, uv: FloatArray) -> tuple[Flo
     """
     tree = cKDTree(anchor_uv)
     mean, distance = _nearby(tree, error, uv)
-    mean_of_others, apart = _nearby(tree, error, anchor_uv, but_itself=True)
-    left = error - np.exp(-apart / REACH_PX) * mean_of_others
+    mean_of_others, to_others = _nearby(tree, error, anchor_uv, but_itself=True)
+    left = error - np.exp(-to_others / REACH_PX) * mean_of_others
     return np.exp(-distance / REACH_PX) * mean, robust_sigma(left)
 
 

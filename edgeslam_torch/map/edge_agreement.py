@@ -11,7 +11,7 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 AGREE_PX = 2.0
 """Maximum distance of a projected edge point from the same edge in another keyframe."""
-USUAL_BEND = 0.015
+DEFAULT_BEND = 0.015
 """Typical relative bend of the map, used if too few keyframes overlap; empirical."""
 SHARED = 1.7
 """Ratio of the depth error to the disagreement of overlapping keyframes, which share part of their error. With this
@@ -54,7 +54,7 @@ def bend(views: list[View], camera: Camera) -> float:
         if off is not None:
             found.append(abs(off))
     if len(found) < _LEAST_PAIRS:
-        return USUAL_BEND
+        return DEFAULT_BEND
     # Of a normal distribution the median is 0.67 sigma; two depths are compared.
     return SHARED * float(np.median(found)) / 0.6745 / math.sqrt(2.0)
 
@@ -112,8 +112,8 @@ class PaintedEdges:
         near = self.index[v[inside].astype(np.intp), u[inside].astype(np.intp)]
         some = np.flatnonzero(near >= 0)
         query, edge = inside[some], near[some]
-        apart = self.uv[edge] - uv[query]
-        close = np.einsum("ij,ij->i", apart, apart) <= AGREE_PX**2
+        offset = self.uv[edge] - uv[query]
+        close = np.einsum("ij,ij->i", offset, offset) <= AGREE_PX**2
         found = np.full(len(uv), -1, dtype=np.int64)
         found[query[close]] = edge[close]
         return found

@@ -124,14 +124,14 @@ def associate_edges(
         partner = nearest_edges(field, at, predicted)
         step = at - field.edges.uv[partner]
         seen = field.edges.normal[partner].astype(np.float64)
-        held = field.inverse_depth[partner].astype(np.float64)
+        partner_iz = field.inverse_depth[partner].astype(np.float64)
         ok = (step * step).sum(1) <= max_px**2
         ok &= (seen * predicted).sum(1) >= np.cos(max_turn_rad)
-        ratio = np.where(held > 0, iz / np.where(held > 0, held, 1.0), 1.0)
+        ratio = np.where(partner_iz > 0, iz / np.where(partner_iz > 0, partner_iz, 1.0), 1.0)
         ok &= (ratio < max_depth_ratio) & (ratio > 1.0 / max_depth_ratio)
         k = np.flatnonzero(ok)
         target = np.full(len(k), pose, dtype=np.int64)
-        parts.append((edge[k], target, field.edges.uv[partner[k]].astype(np.float64), seen[k], held[k]))
+        parts.append((edge[k], target, field.edges.uv[partner[k]].astype(np.float64), seen[k], partner_iz[k]))
     if not parts:
         none, two = np.zeros(0), np.zeros((0, 2))
         return EdgePairs(np.zeros(0, np.int64), np.zeros(0, np.int64), two, two, none)

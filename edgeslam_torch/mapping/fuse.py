@@ -13,18 +13,18 @@ RADIUS_PX = 3.0
 """Search radius at pyramid level 0; poses and points are refined already."""
 MAX_HAMMING = 50
 """Maximum Hamming distance [bits of 256]; the strict threshold of ORB-SLAM2, as there is no ratio test."""
-YOUNG = 3
+NEW_KEYFRAMES = 3
 """Number of keyframes during which a new anchor is searched in its neighbours."""
 
 Pairs = tuple[IntArray, IntArray]
 """Ids ``(M,)`` of pairs of anchors that may be duplicates."""
 
 
-def fuse_young(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
+def fuse_new(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
     """Search a keyframe's new anchors in its neighbours; `fuse_all` searches all."""
     ids = slam_map.anchors_seen_by([keyframe])
-    young = ids[slam_map.anchors.born[ids] > keyframe.id - YOUNG]
-    merge(slam_map, [_look_in(slam_map, camera, k, young) for k in neighbours])
+    new = ids[slam_map.anchors.born[ids] > keyframe.id - NEW_KEYFRAMES]
+    merge(slam_map, [_look_in(slam_map, camera, k, new) for k in neighbours])
 
 
 def fuse_all(slam_map: SlamMap, camera: Camera) -> None:

@@ -10,7 +10,7 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.freed_depths import Weight
 from edgeslam_torch.mapping.fuse import fuse_all
-from edgeslam_torch.mapping.motion_terms import ALIKE_AT_THE_END
+from edgeslam_torch.mapping.motion_terms import EFFECTIVE_SAMPLES_AT_THE_END
 from edgeslam_torch.mapping.refinement import refine, whole_map
 from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
@@ -62,12 +62,12 @@ def last_refinement(
     if config.reprojection != "off":
         with slam_map.lock:
             fuse_all(slam_map, camera)
-        if (window := whole_map(slam_map, freed, ALIKE_AT_THE_END)) is not None:
+        if (window := whole_map(slam_map, freed, EFFECTIVE_SAMPLES_AT_THE_END)) is not None:
             refine(slam_map, window, camera, replace(lm, losses=False, pose_tolerance=NEARLY), telemetry)
     edges.update(everything=True)
     with slam_map.lock:
         edges.follow_anchors()
-    window = whole_map(slam_map, freed, ALIKE_AT_THE_END)
+    window = whole_map(slam_map, freed, EFFECTIVE_SAMPLES_AT_THE_END)
     if window is None:
         return None
     return refine(slam_map, window, camera, lm, telemetry, WindowEdges(edges, camera, config, flying=False))

@@ -17,17 +17,17 @@ from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.sub_pixel import align
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
-from edgeslam_torch.mapping.fuse import fuse_young
+from edgeslam_torch.mapping.fuse import fuse_new
 from edgeslam_torch.mapping.local_loop_closure import MAX_DRIFT_PX, reobserve
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
 from edgeslam_torch.mapping.prior_anchors import (
     add_on_prior,
-    drop_needless_priors,
+    drop_redundant_priors,
     inverse_depth_with_prior,
     prior_of,
     rays,
 )
-from edgeslam_torch.mapping.refinement import choose_window, recent_map, refine, refine_all, young_map
+from edgeslam_torch.mapping.refinement import choose_window, new_map, recent_map, refine, refine_all
 from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.types import FloatArray, IntArray
@@ -96,7 +96,7 @@ class Mapper:
             self.cull_recent_anchors(keyframe)
             neighbours = self.map.covisible(keyframe, self.config.neighbours)
             self.triangulate_new(keyframe, neighbours, colour)
-            fuse_young(self.map, self.camera, keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
+            fuse_new(self.map, self.camera, keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
             drift_px = reobserve(self.map, self.camera, keyframe)
             if self.config.sub_pixel:
                 align(self.map, keyframe, self.camera)
@@ -106,12 +106,12 @@ class Mapper:
         result = self._take_back_drift(keyframe, telemetry)
         if result is None or edges is not None:
             free, fixed = self.config.window, self.config.window_fixed
-            window = young_map(self.map, keyframe, free + fixed) or choose_window(self.map, keyframe, free, fixed)
+            window = new_map(self.map, keyframe, free + fixed) or choose_window(self.map, keyframe, free, fixed)
             result = refine(self.map, window, self.camera, self.lm, telemetry, edges)
         with self.map.lock:
             # Refinement moves the other keyframes too little to change viewing directions.
             self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])
-            drop_needless_priors(self.map, keyframe, np.deg2rad(MIN_PARALLAX_DEG))
+            drop_redundant_priors(self.map, keyframe, np.deg2rad(MIN_PARALLAX_DEG))
             self.cull_keyframes(keyframe)
         return result
 
@@ -120,7 +120,7 @@ class Mapper:
 
         The fixed keyframes of a small window preserve its scale, drifted or not, against telemetry.
         """
-        if telemetry is None or not telemetry.knows_metres or keyframe.stamp_s - self._wide_s < WIDE_EVERY_S:
+        if telemetry is None or not telemetry.metric or keyframe.stamp_s - self._wide_s < WIDE_EVERY_S:
             return None
         self._wide_s = keyframe.stamp_s
         window = recent_map(self.map, keyframe, WIDE)
@@ -138,9 +138,9 @@ class Mapper:
         recent = self._recent[anchors.alive[self._recent]]
         age = keyframe.id - anchors.born[recent]
         rarely_found = anchors.found[recent] < 0.25 * anchors.visible[recent]
-        lonely = (age >= 2) & (anchors.observations[recent] <= 2)
-        self.map.remove_anchors(recent[rarely_found | lonely])
-        self._recent = recent[~(rarely_found | lonely) & (age < 3)]
+        few_views = (age >= 2) & (anchors.observations[recent] <= 2)
+        self.map.remove_anchors(recent[rarely_found | few_views])
+        self._recent = recent[~(rarely_found | few_views) & (age < 3)]
 
     def triangulate_new(self, keyframe: Keyframe, neighbours: list[Keyframe], colour: np.ndarray) -> None:
         """Triangulate keypoints without an anchor in either keyframe."""
@@ -240,8 +240,8 @@ class Mapper:
             return free[:0]
         uv = keyframe.features.uv
         taken = KeypointGrid(uv[keyframe.anchor != NO_ANCHOR])
-        lonely, _ = taken.near(uv[free], np.full(len(free), EMPTY_RADIUS_PX))
-        free = np.delete(free, np.unique(lonely))
+        occupied, _ = taken.near(uv[free], np.full(len(free), EMPTY_RADIUS_PX))
+        free = np.delete(free, np.unique(occupied))
         chosen = free[spread(uv[free], -prior[free, 1], self.camera.width, self.camera.height, missing)]
         return add_on_prior(self.map, self.camera, keyframe, chosen, prior[chosen, 0], prior[chosen], colour[chosen])
 
@@ -254,12 +254,12 @@ class Mapper:
             if len(observed) == 0 or np.mean(self.map.anchors.observations[observed] >= 4) > REDUNDANCY:
                 self.map.remove_keyframe(other)
         while len(self.map.keyframes) > self.config.max_keyframes:
-            needless = self._most_needless(newest)
-            if needless is None:
+            redundant = self._most_redundant(newest)
+            if redundant is None:
                 return
-            self.map.remove_keyframe(needless)
+            self.map.remove_keyframe(redundant)
 
-    def _most_needless(self, newest: Keyframe) -> Keyframe | None:
+    def _most_redundant(self, newest: Keyframe) -> Keyframe | None:
         """The most redundant keyframe outside the window; of equal ones, the oldest.
 
         None if each is the only view of its place and there are fewer than twice `MappingConfig.max_keyframes`.

@@ -17,7 +17,7 @@ reprojections treated as independent outweigh telemetry with a realistic covaria
 corners at whole pixels, since corners are aligned to a fifth of a pixel (docs/decisions/15-telemetry-in-windows.md)."""
 ATTITUDE = 0.25
 """Factor on this number for attitude, at least one in total: errors of tilt and camera mount are systematic."""
-ALIKE_AT_THE_END = 1.0
+EFFECTIVE_SAMPLES_AT_THE_END = 1.0
 """The same in the last refinement: drift was corrected in flight, and telemetry errors, correlated over seconds, would
 deform the map."""
 GUESSED = 3000.0
@@ -70,15 +70,15 @@ def motion_factors(
                     effective_samples * reported.constant,
                 )
             )
-        inert = inertia(stamps, model.scale) if model.knows_metres else None
+        inert = inertia(stamps, model.scale) if model.metric else None
         if inert is not None:
             centres.append(CentreFactor(order, effective_samples * inert, np.zeros(len(inert)), 0.0))
         up, attitude = model.up(stamps), max(1.0, ATTITUDE * effective_samples)
         if up is not None:
             share = GUESSED if model.holds_level else attitude
             gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(share)))
-        told_yaw = model.headings(stamps)
-        if told_yaw is not None:
-            poses = order[told_yaw.frame]
-            turned.append(HeadingFactor(poses, told_yaw.R_c_m, told_yaw.up_m, attitude * told_yaw.information))
+        heading = model.headings(stamps)
+        if heading is not None:
+            poses = order[heading.frame]
+            turned.append(HeadingFactor(poses, heading.R_c_m, heading.up_m, attitude * heading.information))
     return MotionFactors(tuple(centres), tuple(gravity), tuple(turned))

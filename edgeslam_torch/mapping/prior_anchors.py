@@ -113,7 +113,7 @@ def depth_priors(slam_map: SlamMap, anchor: IntArray, poses: list[int]) -> tuple
     return DepthPriors(row, np.array([pose_of[h] for h in host.tolist()]), expected, sigma), outside
 
 
-def drop_needless_priors(slam_map: SlamMap, keyframe: Keyframe, min_parallax_rad: float) -> None:
+def drop_redundant_priors(slam_map: SlamMap, keyframe: Keyframe, min_parallax_rad: float) -> None:
     """Drop the priors of anchors that a keyframe observes from a different direction than their host.
 
     Args:

@@ -43,7 +43,7 @@ class Window:
     anchor: IntArray
     freed: Weight = Weight.NONE
     """Correction of the bias by depth priors."""
-    young: bool = False
+    is_new_map: bool = False
     """Whether this is a whole new map, whose newest keyframe, the last free one, has the pose of tracking."""
     settled: bool = False
     """Whether only a converged result is written back: intermediate poses of the newest keyframes, against which
@@ -70,7 +70,7 @@ def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) ->
     return Window(members, frozen, slam_map.anchors_seen_by(members))
 
 
-def young_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
+def new_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     """The whole submap of the newest keyframe while it has at most ``most`` keyframes.
 
     A map initialised with wrong predicted depths confuses rotation with translation, which a window with two fixed
@@ -81,8 +81,8 @@ def young_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     keyframes = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
     if not 3 <= len(keyframes) <= most:
         return None
-    window = Window(keyframes[1:], keyframes[:1], slam_map.anchors_seen_by(keyframes), young=True)
-    return window if held_extent(window) is not None else None
+    window = Window(keyframes[1:], keyframes[:1], slam_map.anchors_seen_by(keyframes), is_new_map=True)
+    return window if extent_prior(window) is not None else None
 
 
 def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
@@ -105,7 +105,7 @@ def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
         window = Window(recent, earlier[:1], anchor, Weight.WIDE, settled=True)
     else:
         window = Window(recent[1:], recent[:1], anchor, Weight.WIDE, settled=True)
-    return window if len(window.free) >= 2 and held_extent(window) is not None else None
+    return window if len(window.free) >= 2 and extent_prior(window) is not None else None
 
 
 def refine_all(
@@ -129,10 +129,10 @@ def whole_map(
     window = Window(
         keyframes[1:], keyframes[:1], slam_map.anchors_seen_by(keyframes), freed, effective_samples=effective_samples
     )
-    return window if held_extent(window) is not None else None
+    return window if extent_prior(window) is not None else None
 
 
-def held_extent(window: Window) -> ScalePrior | None:
+def extent_prior(window: Window) -> ScalePrior | None:
     """Scale prior if only one pose is fixed: the distance to the farthest other pose. None if no pose is free.
 
     Two fixed poses fix the scale themselves; coincident poses have none. The newest pose of a new map is excluded, as
@@ -141,7 +141,7 @@ def held_extent(window: Window) -> ScalePrior | None:
     if len(window.fixed) != 1 or not window.free:
         return None
     centre = window.fixed[0].centre_w
-    refined = window.free[:-1] if window.young else window.free
+    refined = window.free[:-1] if window.is_new_map else window.free
     distance = np.array([np.linalg.norm(k.centre_w - centre) for k in refined])
     earlier = np.array([math.isinf(k.stamp_s) for k in refined])
     if math.isinf(window.fixed[0].stamp_s) and (distance[earlier] >= MIN_EXTENT).any():
@@ -173,7 +173,7 @@ def refine(
     if window.settled and not result.stop.converged:
         return result
     if problem.scale_priors and result.stop is not StopReason.NOT_FINITE:
-        if window.young and not problem.centres:
+        if window.is_new_map and not problem.centres:
             result = with_same_depths(problem, result, len(window.free))
         elif window.settled:
             result = with_same_way(problem, result, len(window.free))
@@ -210,7 +210,7 @@ def window_problem(
     sigma_px = np.where(np.isnan(aligned), growth[octave], aligned)
     unsure = slam_map.anchors.from_depth[window.anchor]
     # If most depths have priors, these fix the scale; the distance between poses of a rotating camera is noise.
-    extent = None if unsure.sum() > 0.5 * len(unsure) else held_extent(window)
+    extent = None if unsure.sum() > 0.5 * len(unsure) else extent_prior(window)
     priors, hosts = depth_priors(slam_map, window.anchor, [k.id for k in keyframes])
     # A single distance fixes the gauge and carries no information on the metric scale.
     doubt = UNKNOWN_SCALE_LOG if extent is not None else None

@@ -40,7 +40,7 @@ class TermConfig:
     max_px: float = 4.0
     """Maximum distance between a projected edge pixel and its partner."""
     edge_sigma_px: float = 2.0
-    """Edges scatter by 0.8 px on fr1_xyz, but errors of neighbours are correlated: six count as one. Zero disables
+    """Edges scatter by some 0.8 px, but errors of neighbours are correlated: six count as one. Zero disables
     alignment."""
     least_sigma: float = 0.003
     """Minimum relative depth sigma of an edge."""
@@ -303,8 +303,8 @@ def _match(
     arms = _unit(projected[:, 1:] - projected[:, :1])
     straight = np.einsum("iak,jak->ija", arms, other.arms).min(2)
     crossed = np.einsum("iak,jak->ija", arms, other.arms[:, ::-1]).min(2)
-    alike = np.maximum(straight, crossed) > np.cos(config.junction_turn_rad)
-    distance = np.where(alike & (known & front)[:, None] & (distance < config.junction_px), distance, np.inf)
+    similar = np.maximum(straight, crossed) > np.cos(config.junction_turn_rad)
+    distance = np.where(similar & (known & front)[:, None] & (distance < config.junction_px), distance, np.inf)
     best = distance.argmin(1)
     mutual = np.isfinite(distance.min(1)) & (distance.argmin(0)[best] == np.arange(len(uv)))
     return np.flatnonzero(mutual), best[mutual]

@@ -1,7 +1,7 @@
 """Positions that follow the map: each is stored in the frame of the view in which it was seen.
 
-A loop, a joined submap or a revision of metres corrects the poses of the views; positions tied to them are then read
-where the corrected map has them, and nobody has to move them along.
+A loop, a joined submap or a revision of metres corrects the poses of the views. Positions relative to them follow
+without an update of their own.
 """
 
 from dataclasses import dataclass

@@ -25,20 +25,20 @@ SCALES = {
     "corner": (1.0, 0.5, 3.0),
     "angle": (0.05, 0.01, 0.3),
 }
-"""Usual standard deviation of each term, and bounds, so that no window lets a term dominate or disables it."""
-USUAL = 0.8
-"""Weight of the usual standard deviation (in its logarithm) beside that of one map."""
+"""Prior standard deviation of each term, and bounds, so that no window lets a term dominate or disables it."""
+PRIOR_WEIGHT = 0.8
+"""Weight of the prior standard deviation (in its logarithm) beside that of one map."""
 MIN_COUNT = 30
 """Minimum number of residuals to measure a standard deviation."""
 
 
 def term_sigmas(residuals: dict[str, FloatArray]) -> dict[str, float]:
-    """Standard deviation of every term from its valid residuals; the usual one without enough of them."""
+    """Standard deviation of every term from its valid residuals; the prior one without enough of them."""
     sigmas: dict[str, float] = {}
-    for name, (usual, low, high) in SCALES.items():
+    for name, (prior, low, high) in SCALES.items():
         found = residuals.get(name, np.zeros(0))
-        measured = robust_sigma(found) if found.size >= MIN_COUNT else usual
-        sigmas[name] = usual**USUAL * min(max(measured, low), high) ** (1.0 - USUAL)
+        measured = robust_sigma(found) if found.size >= MIN_COUNT else prior
+        sigmas[name] = prior**PRIOR_WEIGHT * min(max(measured, low), high) ** (1.0 - PRIOR_WEIGHT)
     return sigmas
 
 
@@ -106,14 +106,14 @@ _LOSSES = {
 }
 
 
-def with_scales(problem: WindowProblem, sigma: dict[str, float], alike: float = 1.0) -> WindowProblem:
+def with_scales(problem: WindowProblem, sigma: dict[str, float], inflation: float = 1.0) -> WindowProblem:
     """The window with its terms' standard deviations replaced; terms that are off stay off.
 
     Args:
         problem: A window.
         sigma: From `term_sigmas`.
-        alike: Factor on the sigmas of edge terms: errors of neighbouring pixels on an edge are correlated, so
-            ``alike**2`` of them count as one.
+        inflation: Factor on the sigmas of edge terms: errors of neighbouring pixels on an edge are correlated, so
+            ``inflation**2`` of them count as one.
     """
     problem = replace(problem, inv_sigma=problem.inv_sigma / sigma["reproj"])
     edges, junctions = problem.edges, problem.junctions
@@ -121,8 +121,8 @@ def with_scales(problem: WindowProblem, sigma: dict[str, float], alike: float = 
         name = "edge" if edges.cycle_px else "cycle"
         edges = replace(
             edges,
-            pair_inv_sigma=np.where(edges.pair_inv_sigma > 0, 1.0 / (alike * sigma["edge"]), 0.0),
-            cycle_sigma=alike * sigma[name] if edges.cycle_sigma > 0 else 0.0,
+            pair_inv_sigma=np.where(edges.pair_inv_sigma > 0, 1.0 / (inflation * sigma["edge"]), 0.0),
+            cycle_sigma=inflation * sigma[name] if edges.cycle_sigma > 0 else 0.0,
         )
     if junctions is not None:
         junctions = replace(

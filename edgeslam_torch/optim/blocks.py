@@ -231,14 +231,14 @@ class Edges(Hosted):
         self.uv = _floats(terms.uv).reshape(-1, 2)
         self.uv_j, self.normal_j = (_floats(x).reshape(-1, 2)[self.order] for x in (terms.pair_uv, terms.pair_normal))
         self.inv_sigma = _floats(terms.pair_inv_sigma)[self.order]
-        self.held = _floats(terms.pair_inverse_depth)[self.order]
-        has_cycle = terms.cycle_sigma > 0 and bool((self.held > 0).any())
+        self.target_inverse_depth = _floats(terms.pair_inverse_depth)[self.order]
+        has_cycle = terms.cycle_sigma > 0 and bool((self.target_inverse_depth > 0).any())
         form = edge_kernel.PIXEL if terms.cycle_px else edge_kernel.RELATIVE_DEPTH
         self.cycle = (form, 1.0 / terms.cycle_sigma) if has_cycle else (edge_kernel.NONE, 0.0)
 
     def residuals(self, T_j_i: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """See `Hosted`."""
-        partner = self.uv_j, self.normal_j, self.inv_sigma, self.held
+        partner = self.uv_j, self.normal_j, self.inv_sigma, self.target_inverse_depth
         depth = np.ascontiguousarray(x[:, 0])
         return self.rows.edges(T_j_i, self.view, self.block, self.uv, depth, *partner, *self.cycle, self.K)
 

@@ -23,7 +23,7 @@ Frames = deque[tuple[int, View]]
 def place_lost_frames(
     lost: Frames, tracker: Tracker, log: TrajectoryLog, keyframe: Keyframe, T_c_w: FloatArray, anchors: IntArray
 ) -> int:
-    """Track lost frames one by one, newest first, and forget them; returns the number of localised ones.
+    """Track lost frames one by one, newest first, and remove them from ``lost``; returns the number of localised ones.
 
     Args:
         lost: Frames without a pose.

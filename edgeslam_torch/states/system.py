@@ -166,8 +166,8 @@ class System:
         """`Health.submap_sigma` and `drift_sigma` of the present pose in a submap."""
         if not self.log.records:
             return 0.0, 0.0
-        apart, _ = self.graph.apart(piece, self.graph.first, se3.inverse(self.motion.T_c_w)[:3, 3])
-        return self.published.scale * apart, self.published.scale * self.graph.drift
+        sigma_t, _ = self.graph.uncertainty(piece, self.graph.first, se3.inverse(self.motion.T_c_w)[:3, 3])
+        return self.published.scale * sigma_t, self.published.scale * self.graph.drift
 
     def add_earlier(self, since_s: float, track: Track) -> None:
         """Pass logged frames since a stamp to the fusion once a map supports them; covariance from ``track``."""
@@ -193,7 +193,7 @@ class System:
         """Current telemetry, if the settings use it in one of these refinements."""
         wanted = self.has_telemetry and self.config.window.telemetry in where
         model = self.fusion.telemetry() if wanted else None
-        return None if model is None else replace(model, young=self._is_new(self.motion.stamp_s))
+        return None if model is None else replace(model, new_map=self._is_new(self.motion.stamp_s))
 
     def _is_new(self, stamp_s: float) -> bool:
         """Whether the submap of a frame began seconds ago."""

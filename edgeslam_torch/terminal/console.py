@@ -22,7 +22,7 @@ _CONTROL = {
 }
 """C0 and C1 controls, and marks that turn the direction of writing."""
 _COLUMNS = 80
-"""Width of a terminal that does not know its own, or says 0."""
+"""Width assumed for a terminal that reports none, or 0."""
 _MOMENT_S = 0.5
 """Longest wait for another thread's line: a terminal may be stopped (Ctrl-S), and a drone must land nevertheless."""
 

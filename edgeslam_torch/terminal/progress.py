@@ -58,7 +58,7 @@ class Progress:
         self._redraw = self._console.isatty() if redraw is None else redraw
         self._clock = clock
         self.words: Callable[[], str] = str
-        """What else there is to say, asked whenever it is shown; nothing by default."""
+        """Further text, evaluated whenever the line is shown; none by default."""
         self._printed_s, self._printed = clock(), ""
         self._begin(what, total, unit, done)
         self._ended = threading.Event()

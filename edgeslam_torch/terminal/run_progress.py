@@ -14,7 +14,7 @@ _STEP = 0.1
 
 
 class RunSource(Protocol):
-    """What a run's progress asks of its source."""
+    """What the progress line reads of a source."""
 
     @property
     def length(self) -> int | None:

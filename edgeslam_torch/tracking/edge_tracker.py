@@ -236,7 +236,7 @@ def _nearest(keyframes: list[Keyframe], T_c_w: FloatArray) -> list[Keyframe]:
     """The keyframes nearest in position and direction."""
     centre = -T_c_w[:3, :3].T @ T_c_w[:3, 3]
     turn = [np.arccos(np.clip(k.T_c_w[2, :3] @ T_c_w[2, :3], -1.0, 1.0)) for k in keyframes]
-    apart = [float(np.linalg.norm(k.centre_w - centre)) for k in keyframes]
-    scale = max(float(np.median(apart)), 1e-9)
-    order = np.argsort(np.array(turn) + np.array(apart) / scale, kind="stable")
+    distance = [float(np.linalg.norm(k.centre_w - centre)) for k in keyframes]
+    scale = max(float(np.median(distance)), 1e-9)
+    order = np.argsort(np.array(turn) + np.array(distance) / scale, kind="stable")
     return [keyframes[i] for i in order[:HOSTS]]

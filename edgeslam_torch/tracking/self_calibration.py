@@ -297,9 +297,9 @@ def _centred(uv: FloatArray, camera: Camera) -> FloatArray:
 
 def _same_anchors(a: Keyframe, b: Keyframe) -> tuple[IntArray, IntArray]:
     """Keypoints of both that observe the same anchors."""
-    held_a, held_b = a.keypoints_with_anchor(), b.keypoints_with_anchor()
-    _, at_a, at_b = np.intersect1d(a.anchor[held_a], b.anchor[held_b], return_indices=True)
-    return held_a[at_a], held_b[at_b]
+    with_anchor_a, with_anchor_b = a.keypoints_with_anchor(), b.keypoints_with_anchor()
+    _, at_a, at_b = np.intersect1d(a.anchor[with_anchor_a], b.anchor[with_anchor_b], return_indices=True)
+    return with_anchor_a[at_a], with_anchor_b[at_b]
 
 
 def _spread(frames: Sequence[np.ndarray]) -> list[np.ndarray]:

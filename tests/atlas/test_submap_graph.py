@@ -66,10 +66,10 @@ def test_rotational_uncertainty_grows_with_the_distance_travelled_in_the_submap(
         grown = math.exp(rng.normal(0.0, 0.02) + rng.normal(0.0, 0.02))
         off.append(rng.normal(0.0, 0.1, 3) + grown * (T[:3, :3] @ at(3.0)) - at(3.0))
     worst_axis = np.sqrt(np.mean(np.square(off), axis=0)).max()
-    sigma_t, sigma_r = graph.apart(1, 0, at(8.0))
+    sigma_t, sigma_r = graph.uncertainty(1, 0, at(8.0))
     assert worst_axis <= sigma_t <= 1.25 * worst_axis
     assert sigma_r == 0.05
-    assert graph.apart(0, 1, at(8.0)) == (sigma_t, sigma_r)
+    assert graph.uncertainty(0, 1, at(8.0)) == (sigma_t, sigma_r)
 
 
 def test_uncertainties_of_successive_submaps_add():
@@ -77,24 +77,24 @@ def test_uncertainties_of_successive_submaps_add():
     graph = world.graph()
     world.begin(graph, 1, 0.3, 0.0)
     world.begin(graph, 2, 0.4, 0.1)
-    assert graph.apart(2, 0, at(2.0)) == (pytest.approx(0.5), pytest.approx(0.1))
-    assert graph.apart(2, 0, at(5.0))[0] == pytest.approx(math.hypot(0.5, 0.3))
+    assert graph.uncertainty(2, 0, at(2.0)) == (pytest.approx(0.5), pytest.approx(0.1))
+    assert graph.uncertainty(2, 0, at(5.0))[0] == pytest.approx(math.hypot(0.5, 0.3))
     world.piece = [0, 0, 2]  # the second one was merged
-    assert graph.apart(0, 0, at(2.0)) == (0.0, 0.0)
+    assert graph.uncertainty(0, 0, at(2.0)) == (0.0, 0.0)
 
 
 def test_a_submap_without_a_sensor_prediction_is_unrelated():
     world = World([0.0, 1.0], [0, 1])
     graph = world.graph()
-    assert graph.apart(1, 0, at(0.0)) == (math.inf, math.inf)
+    assert graph.uncertainty(1, 0, at(0.0)) == (math.inf, math.inf)
     world.begin(graph, 1, math.inf, math.inf)
-    assert graph.apart(1, 0, at(1.0))[0] == math.inf
+    assert graph.uncertainty(1, 0, at(1.0))[0] == math.inf
 
 
 def test_the_first_submap_of_a_flight_has_no_uncertainty():
     graph = World([0.0], [3]).graph()
     graph.begin(3, graph.map.keyframes[0], 0.1, 0.1)
-    assert graph.apart(3, graph.first, at(9.0)) == (0.0, 0.0)
+    assert graph.uncertainty(3, graph.first, at(9.0)) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(

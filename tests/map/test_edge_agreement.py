@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.map.edge_agreement import SHARED, USUAL_BEND, View, bend
+from edgeslam_torch.map.edge_agreement import DEFAULT_BEND, SHARED, View, bend
 
 CAMERA = Camera(640, 480, 400.0, 400.0, 319.5, 239.5)
 
@@ -67,4 +67,4 @@ def test_without_overlap_the_default_applies(rng, case):
             turn = np.deg2rad(90.0 * i)
             view.T_w_c[:3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
         views = views[:4]
-    assert bend(views, CAMERA) == USUAL_BEND
+    assert bend(views, CAMERA) == DEFAULT_BEND

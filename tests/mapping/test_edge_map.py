@@ -9,7 +9,7 @@ from point_map import CAMERA, PointMap, small_motion
 from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.depth_prior import depth_prior
-from edgeslam_torch.map.edge_agreement import AGREE_PX, USUAL_BEND, PaintedEdges
+from edgeslam_torch.map.edge_agreement import AGREE_PX, DEFAULT_BEND, PaintedEdges
 from edgeslam_torch.mapping.edges.edge_map import PRIOR_CELL_PX, EdgeMap, EdgePoints, fuse_voxels
 
 
@@ -129,7 +129,7 @@ def test_sigma_of_a_point_includes_map_deformation(points):
     seen = host(points, 0, points.world.p_w[points.world.visible[0]][:20], observations=np.full(20, 2, np.int32))
     some = edge_map(points, voxel=1e-6)
     some.hosts.append(seen)
-    expected = np.hypot(0.01, USUAL_BEND * seen.p_c[:, 2])
+    expected = np.hypot(0.01, DEFAULT_BEND * seen.p_c[:, 2])
     np.testing.assert_allclose(np.sort(some.points().sigma_m), np.sort(expected), rtol=1e-5)
     np.testing.assert_array_equal(seen.sigma, 0.01)  # the edge's own, which the solver uses, stays
 

@@ -8,11 +8,11 @@ from point_map import CAMERA, PointMap, check_map
 
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import words
-from edgeslam_torch.mapping.fuse import fuse_all, fuse_young, merge
+from edgeslam_torch.mapping.fuse import fuse_all, fuse_new, merge
 
 
 def among_neighbours(points, keyframe):
-    fuse_young(points.map, CAMERA, keyframe, points.map.covisible(keyframe, 12))
+    fuse_new(points.map, CAMERA, keyframe, points.map.covisible(keyframe, 12))
 
 
 def in_the_whole_map(points, keyframe):

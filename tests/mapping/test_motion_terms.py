@@ -330,7 +330,7 @@ def test_gravity_dominates_in_a_new_map_without_metric_scale(rng, halves):
     model = telemetry_of(rng, halves)
     (before,), (after,) = (
         motion_factors(m, halves.keyframes, [0] * 6).gravity
-        for m in (replace(model, scale_sigma_log=np.inf, velocity=False, young=True), model)
+        for m in (replace(model, scale_sigma_log=np.inf, velocity=False, new_map=True), model)
     )
     assert np.degrees(before.sigma_rad) < 0.1 < 0.5 < np.degrees(after.sigma_rad)
 

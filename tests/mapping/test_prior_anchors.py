@@ -10,7 +10,7 @@ from edgeslam_torch.mapping.prior_anchors import (
     add_on_prior,
     depth_priors,
     depth_slack_px,
-    drop_needless_priors,
+    drop_redundant_priors,
     inverse_depth_with_prior,
     mostly_on_priors,
     prior_of,
@@ -126,9 +126,9 @@ def test_a_window_without_such_anchors_has_no_priors(points):
 def test_parallax_drops_the_prior_of_an_anchor(points):
     ids = on_priors(points, error=1.0)
     other = points.keyframes[3]
-    drop_needless_priors(points.map, points.keyframes[0], np.deg2rad(1.0))
+    drop_redundant_priors(points.map, points.keyframes[0], np.deg2rad(1.0))
     assert points.map.anchors.from_depth[ids].all(), "its own host sees no parallax"
-    drop_needless_priors(points.map, other, np.deg2rad(1.0))
+    drop_redundant_priors(points.map, other, np.deg2rad(1.0))
     held = other.anchor[other.anchor >= 0]
     p = points.map.anchors.p_w[held]
     a, b = p - points.keyframes[0].centre_w, p - other.centre_w

@@ -10,11 +10,11 @@ from edgeslam_torch.mapping.last_refinement import lm_config
 from edgeslam_torch.mapping.refinement import (
     Window,
     choose_window,
+    new_map,
     recent_map,
     refine,
     refine_all,
     window_problem,
-    young_map,
 )
 from edgeslam_torch.optim.pose_only import refine_pose
 from edgeslam_torch.optim.problem import LmConfig, StopReason
@@ -235,7 +235,7 @@ def test_a_new_map_of_a_wrong_shape_is_corrected(seed):
     bend(points)
     assert worst_turn_deg(points) > 1.0
     before = median_depth(points)
-    window = young_map(points.map, points.keyframes[-1], 25)
+    window = new_map(points.map, points.keyframes[-1], 25)
     refine(points.map, window, CAMERA, lm_config(WindowConfig()))
     assert worst_turn_deg(points) < 0.1
     assert median_depth(points) == pytest.approx(before, rel=0.02)
@@ -249,15 +249,15 @@ def test_the_scale_of_a_new_map_is_fixed_by_refined_poses(points, rng):
     T_w_c = newest.T_w_c.copy()
     T_w_c[:3, 3] += 0.1 * (newest.centre_w - centre)
     newest.T_c_w = se3.inverse(T_w_c)
-    refine(points.map, young_map(points.map, newest, 25), CAMERA, LmConfig())
+    refine(points.map, new_map(points.map, newest, 25), CAMERA, LmConfig())
     after = [np.linalg.norm(k.centre_w - centre) for k in points.keyframes]
     np.testing.assert_allclose(after, distance, rtol=2e-3, atol=1e-6)
 
 
 def test_only_a_small_map_is_new(points):
     newest = points.keyframes[-1]
-    assert young_map(points.map, newest, len(points.keyframes)).free[-1] is newest
-    assert young_map(points.map, newest, len(points.keyframes) - 1) is None
+    assert new_map(points.map, newest, len(points.keyframes)).free[-1] is newest
+    assert new_map(points.map, newest, len(points.keyframes) - 1) is None
     for keyframe in points.keyframes[1:-1]:
         points.map.remove_keyframe(keyframe)
-    assert young_map(points.map, newest, 25) is None  # two keyframes leave nothing to straighten
+    assert new_map(points.map, newest, 25) is None  # two keyframes leave nothing to straighten

@@ -43,7 +43,7 @@ def test_scaled_terms_have_unit_residuals_and_terms_that_are_off_stay_off():
     problem = replace(problem, edges=edges, junctions=replace(problem.junctions, inv_sigma_angle=0.0))
     r = term_residuals(problem)
     scales = term_sigmas(r) | {name: robust_sigma(found) for name, found in r.items()}
-    scaled = with_scales(problem, scales, alike=2.0)
+    scaled = with_scales(problem, scales, inflation=2.0)
     assert scaled.edges.pair_inv_sigma[0] * float(robust_sigma(r["edge"])) == pytest.approx(0.5, rel=0.02)
     assert scaled.edges.cycle_sigma == pytest.approx(2.0 * float(robust_sigma(r["cycle"])), rel=0.02)
     assert scaled.junctions.inv_sigma_angle == 0.0

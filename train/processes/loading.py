@@ -78,7 +78,7 @@ def _unpacked(batches: Iterator[Any]) -> Iterator[Any]:
 
 
 def _started(loader: DataLoader[Any]) -> Iterator[Any]:
-    """The loader at work. OpenCV's threads do not survive a fork: a child that used them would wait for ever."""
+    """The loader at work. OpenCV's threads do not survive a fork: a child that used them would deadlock."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

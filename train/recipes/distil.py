@@ -63,7 +63,7 @@ def distil(
     """Train ``student`` on the teacher's depth of ``runs``; resumes a training in ``out`` with the same inputs.
 
     Metres are the teacher's, or the run's where it has none. The other arguments are those of `finetune`; ``say`` is
-    told what there is to learn from, in the first process.
+    called with a summary of the data, in the first process.
 
     Raises:
         ConfigError: If neither the teacher nor a run gives metres; and as `finetune`.

@@ -83,8 +83,8 @@ class Phase:
         return load_checkpoint(out / FINAL)[0]
 
 
-# Rendered rooms supervise shape only: their sizes are invented, and with metric=1 the error on redkitchen doubled
-# within 250 steps.
+# Rendered rooms supervise shape only: their sizes are invented, and as metric labels they double the error in real
+# rooms.
 BROAD = Phase(
     {"tum_fr1_rpy_depth": 0.5, "icl_livingroom1": 0.15, RENDERED: 0.35},
     TrainConfig(steps=2200, lr=1e-3, encoder_lr=1.2e-4, lr_end=1.0, validate_every=550, checkpoint_every=100),

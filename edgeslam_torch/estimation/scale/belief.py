@@ -4,7 +4,7 @@ The essential matrix gives translation up to scale, and the paper does not say h
 (velocities, heights, IMU, depth network, an earlier flight's map) gives a `ScaleBelief`: the log of metres per map unit
 with a standard deviation. `decide` averages those that agree.
 
-The average of a right estimate and a wrong one is wrong. So estimates that the gate tells apart are not averaged: the
+The average of a right estimate and a wrong one is wrong. So estimates that fail the gate are not averaged: the
 consistent group with the most votes is used. The depth network has a little less than one: its error is common to
 all keyframes, whereas displacements and heights are many independent measurements; an IMU has more than two, since its
 unit cannot be mistaken. A single sensor may be in the wrong unit. If that and a wrong network are both plausible,
@@ -54,9 +54,9 @@ class ScaleBelief:
 
 
 def contradict(a: ScaleBelief, b: ScaleBelief) -> bool:
-    """Whether two estimates are too far apart to be averaged."""
-    apart = np.array([a.log_scale - b.log_scale])
-    return not passes(apart, np.array([[a.sigma**2 + b.sigma**2]]), _CONFIDENCE)
+    """Whether two estimates are inconsistent: their average would be wrong."""
+    difference = np.array([a.log_scale - b.log_scale])
+    return not passes(difference, np.array([[a.sigma**2 + b.sigma**2]]), _CONFIDENCE)
 
 
 @dataclass(frozen=True, slots=True)

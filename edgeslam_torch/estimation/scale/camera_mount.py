@@ -56,8 +56,8 @@ def mount_by_turns(
     turned = np.zeros(6)
     for _ in range(_STEPS):
         map_turned, mount_turned = Rotation.from_rotvec(turned.reshape(2, 3)).as_matrix()
-        apart = Rotation.from_matrix(R_b_w @ map_turned @ R_w_m @ R_m_c @ (mount_turned @ R_b_c).T).as_rotvec()
-        turned -= covariance @ (np.einsum("ain,na->i", weighted, apart) + prior @ turned)
+        error = Rotation.from_matrix(R_b_w @ map_turned @ R_w_m @ R_m_c @ (mount_turned @ R_b_c).T).as_rotvec()
+        turned -= covariance @ (np.einsum("ain,na->i", weighted, error) + prior @ turned)
     map_turned, mount_turned = Rotation.from_rotvec(turned.reshape(2, 3)).as_matrix()
     sigma = np.sqrt(np.diag(covariance)[:3] + _BENT_RAD**2)
     return Turned(mount_turned @ R_b_c, map_turned @ R_w_m, sigma)

@@ -31,8 +31,8 @@ MOST_SIGMA = 0.5
 
 _MAP_NOISE_LOG = 0.05
 """Log error of triangulated depth: regularises the slope towards 0 in scenes of uniform depth."""
-_USUAL_WANDER_LOG = 0.15
-_USUAL_COUNTS = 4
+_PRIOR_WANDER_LOG = 0.15
+_PRIOR_COUNT = 4
 """Prior variation for few keyframes: the calibration's median, weighted as this many keyframes."""
 _KEPT = 200
 """Maximum number of ratios stored, at least the map's number of keyframes."""
@@ -172,11 +172,11 @@ class DepthRatios:
         mean, statistical = _robust_mean(ratio, spread)
         weight = points * depth_spread**2
         pooled = float(np.sum(weight * slope) / np.sum(weight + points * _MAP_NOISE_LOG**2))
-        usual = float(np.median(spread))
-        seen = _USUAL_COUNTS * _USUAL_WANDER_LOG**2 + len(ratio) * _robust_deviation(ratio) ** 2
-        wander = math.sqrt(seen / (_USUAL_COUNTS + len(ratio)))
-        doubts = (SLOPE_SIGMA * (1.0 - pooled), SPREAD_SIGMA * usual, WANDER_SIGMA * wander)
-        return DepthScale(mean, math.hypot(self._least_sigma, statistical, *doubts), pooled, usual, wander)
+        typical = float(np.median(spread))
+        seen = _PRIOR_COUNT * _PRIOR_WANDER_LOG**2 + len(ratio) * _robust_deviation(ratio) ** 2
+        wander = math.sqrt(seen / (_PRIOR_COUNT + len(ratio)))
+        doubts = (SLOPE_SIGMA * (1.0 - pooled), SPREAD_SIGMA * typical, WANDER_SIGMA * wander)
+        return DepthScale(mean, math.hypot(self._least_sigma, statistical, *doubts), pooled, typical, wander)
 
 
 def _robust_mean(x: FloatArray, sigma: FloatArray) -> tuple[float, float]:

@@ -38,13 +38,13 @@ MIN_DISPLACEMENTS = 6
 _MIN_HEIGHTS = 4
 _BELIEF = 20.0
 """Weight of the expected noise against the observed one, in residuals."""
-_WHEN_TOLD_APART = 2
+_SELECTED_AT = 2
 """Iteration in which the map's wander is selected: by then the worst outliers are downweighted."""
 _MOST_PARTS = 4
 """Maximum number of parts of a flight whose scales are compared; shorter parts are too noisy."""
 _VIEW_RAD = math.radians(60.0)
 """Typical field of view."""
-_YOUNG_S = 1.0
+_LEAST_AGE_S = 1.0
 """Lower bound of the map's age."""
 _BIN_S = 0.5
 _SCALE, _THETA, _OFFSETS = 0, slice(0, 4), slice(4, None)
@@ -136,13 +136,13 @@ def displacement_evidence(
     if n < MIN_DISPLACEMENTS or not length > 0:
         return None
     sigma_map = np.minimum(sigma_map, 0.3 * math.sqrt(length / (3 * n)))
-    apart_s = from_s[:, None] - from_s[None]
-    memory = np.exp(-np.abs(apart_s) / VELOCITY_BIAS_MEMORY_S)
+    lag_s = from_s[:, None] - from_s[None]
+    memory = np.exp(-np.abs(lag_s) / VELOCITY_BIAS_MEMORY_S)
     bias = VELOCITY_BIAS_M_S**2 * memory * np.outer(duration_s, duration_s)
     s = math.sqrt(float(np.sum(moved_m**2)) / length)
     if not (math.isfinite(s) and s > 1e-9):
         return None
-    drifting = _of_changes(apart_s, duration_s, MAP_DRIFT_MEMORY_S)
+    drifting = _of_changes(lag_s, duration_s, MAP_DRIFT_MEMORY_S)
     wandering = 0.0 * bias if aged is None else s**2 * _common(aged) * (moved_map @ moved_map.T)
     J = np.concatenate([moved_map[:, :, None], -hat(moved_map)], axis=2).transpose(1, 0, 2)  # (3, N, 4)
     target = moved_m.T[:, :, None]  # (3, N, 1)
@@ -156,7 +156,7 @@ def displacement_evidence(
         white = (sigma_m**2 + (s * sigma_map) ** 2) / np.maximum(weight, _LEAST_WEIGHT)
         prior = _tilt_prior(s, tilt_sigma_rad)
         likeliest = -math.inf
-        for a, c in possible if k == _WHEN_TOLD_APART else [chosen]:
+        for a, c in possible if k == _SELECTED_AT else [chosen]:
             slow = bias + a**2 * drifting + c**2 * wandering
             found = _fitted(white, slow, J, latent, target, prior)
             if found is not None and found.log_likelihood > likeliest:
@@ -241,7 +241,7 @@ def height_evidence(
     for k in range(4):
         white = (sigma_m**2 + (scale * sigma_map) ** 2) / count / np.maximum(weight, _LEAST_WEIGHT)
         likeliest = -math.inf
-        for a in MAP_DRIFT_M if k == _WHEN_TOLD_APART else [drift]:
+        for a in MAP_DRIFT_M if k == _SELECTED_AT else [drift]:
             found = _fitted(white, a**2 * memory + wandering, J, J, z[None, :, None], prior)
             if found is not None and found.log_likelihood > likeliest:
                 fit, drift, likeliest = found, a, found.log_likelihood
@@ -287,14 +287,14 @@ def _unrest(covariance: FloatArray, fit: "_Fit", J: FloatArray, latent: FloatArr
     room = total - squares / max(total, 1e-30)
     if not room > 0:
         return 0.0
-    apart = float(np.sum(information * (scale - np.sum(information * scale) / total) ** 2))
-    between = max(0.0, (apart - (parts - 1)) / room)
+    scatter = float(np.sum(information * (scale - np.sum(information * scale) / total) ** 2))
+    between = max(0.0, (scatter - (parts - 1)) / room)
     return math.sqrt(between * squares) / total
 
 
 def aged_since(stamps_s: FloatArray, began_s: float, now_s: float) -> FloatArray:
     """Log of the map's age now over its age at each stamp ``(N,)``; a map drifts most in its first seconds."""
-    return np.asarray(np.log((now_s - began_s + _YOUNG_S) / (np.maximum(stamps_s - began_s, 0.0) + _YOUNG_S)))
+    return np.asarray(np.log((now_s - began_s + _LEAST_AGE_S) / (np.maximum(stamps_s - began_s, 0.0) + _LEAST_AGE_S)))
 
 
 def turned_since(T: FloatArray) -> FloatArray:
@@ -310,14 +310,14 @@ def _common(aged: FloatArray) -> FloatArray:
     return np.minimum(aged[:, None], aged[None])
 
 
-def _of_changes(apart_s: FloatArray, duration_s: FloatArray, memory_s: float) -> FloatArray:
+def _of_changes(lag_s: FloatArray, duration_s: FloatArray, memory_s: float) -> FloatArray:
     """Correlation of an Ornstein-Uhlenbeck process's changes over intervals ``(N, N)``."""
 
     def at(gap_s: FloatArray) -> FloatArray:
         return np.asarray(np.exp(-np.abs(gap_s) / memory_s))
 
     mine, other = duration_s[:, None], duration_s[None]
-    return at(apart_s + mine - other) + at(apart_s) - at(apart_s + mine) - at(apart_s - other)
+    return at(lag_s + mine - other) + at(lag_s) - at(lag_s + mine) - at(lag_s - other)
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,10 +42,10 @@ class Turns:
 
 
 @dataclass(frozen=True, slots=True)
-class Apart:
+class AttitudeDeviation:
     """RMS deviation between attitude and images, and the visual rotation; per body axis [rad]."""
 
-    apart: FloatArray
+    rms: FloatArray
     """``(3,)`` RMS of the rotation between both."""
     lately: FloatArray
     """``(3,)`` the same over the newest `LATELY` frames: a sudden fault."""
@@ -55,7 +55,7 @@ class Apart:
     """``(3,)`` root mean square of their rates [rad/s]."""
 
 
-def apart(reported: Attitudes, R_b_c: FloatArray, sigma_rad: float) -> Apart:
+def attitude_deviation(reported: Attitudes, R_b_c: FloatArray, sigma_rad: float) -> AttitudeDeviation:
     """Deviation between attitude and images over the whole flight, with mount and map rotation fitted.
 
     Attitudes, unlike their increments, reveal a jump, a frozen reading and a wrong sign: the rotation from the map to
@@ -72,7 +72,7 @@ def apart(reported: Attitudes, R_b_c: FloatArray, sigma_rad: float) -> Apart:
     rpy = np.unwrap(Rotation.from_matrix(seen).as_euler("ZYX")[:, ::-1], axis=0)
     rate = np.diff(rpy, axis=0) / np.diff(reported.stamp_s)[:, None]
     rms = [np.sqrt(np.mean(x**2, axis=0)) for x in (off, off[-LATELY:], rate)]
-    return Apart(rms[0], rms[1], np.std(rpy, axis=0), rms[2])
+    return AttitudeDeviation(rms[0], rms[1], np.std(rpy, axis=0), rms[2])
 
 
 def attitudes(sightings: Sightings, track: TelemetryTrack, delay_s: float) -> Attitudes | None:

@@ -10,7 +10,7 @@ from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.scale.belief import ScaleBelief
 from edgeslam_torch.estimation.telemetry.alignment import (
     Attitudes,
-    apart,
+    attitude_deviation,
     attitudes,
     camera_moved,
     in_common,
@@ -47,7 +47,7 @@ _LEAST_TURN_RAD_S = math.radians(2.0)
 """Minimum rotation rate: whole degrees twice a second are noise below."""
 _FEW_ATTITUDES = 15
 """Minimum number of frames for validating attitude: a second and a half."""
-_APART_SHARE, _APART_RAD, MOST_APART_RAD = 0.5, math.radians(2.0), math.radians(6.0)
+_DEVIATION_SHARE, _DEVIATION_RAD, MAX_DEVIATION_RAD = 0.5, math.radians(2.0), math.radians(6.0)
 """Maximum RMS deviation between attitude and images about an axis: a share of the rotation about it, within bounds.
 Correct attitude (whole degrees, mount off by 7 degrees) deviates by 0.3 to 1 degree; a frozen column by the whole
 rotation, a sign error by twice that."""
@@ -169,18 +169,20 @@ class Comparison:
         for delay_s in delays_s:
             reported = attitudes(sightings, present.track, delay_s)
             if reported is not None and len(reported.stamp_s) >= _FEW_ATTITUDES:
-                ratios.append(self._parted(reported, present.R_b_c, delay.sigma_s if known else _DELAY_STEP_S))
+                ratios.append(
+                    self._relative_deviation(reported, present.R_b_c, delay.sigma_s if known else _DELAY_STEP_S)
+                )
         if not ratios:
             return ()
         best = min(ratios, key=max)
         return tuple(name for name, ratio in zip(ATTITUDE, best.tolist(), strict=True) if ratio > 1.0)
 
-    def _parted(self, reported: Attitudes, R_b_c: FloatArray, delay_sigma_s: float) -> FloatArray:
+    def _relative_deviation(self, reported: Attitudes, R_b_c: FloatArray, delay_sigma_s: float) -> FloatArray:
         """Deviation about each axis relative to the allowed one ``(3,)``."""
-        found = apart(reported, R_b_c, self._config.alignment_sigma_rad)
-        share = np.clip(_APART_SHARE * found.seen, _APART_RAD, MOST_APART_RAD)
+        found = attitude_deviation(reported, R_b_c, self._config.alignment_sigma_rad)
+        share = np.clip(_DEVIATION_SHARE * found.seen, _DEVIATION_RAD, MAX_DEVIATION_RAD)
         late = delay_sigma_s * found.rate
-        return np.maximum(found.apart / np.hypot(share, late), found.lately / np.hypot(MOST_APART_RAD, 2.0 * late))
+        return np.maximum(found.rms / np.hypot(share, late), found.lately / np.hypot(MAX_DEVIATION_RAD, 2.0 * late))
 
 
 def _surely_better(best: Agreement, now: Agreement) -> bool:

@@ -40,7 +40,7 @@ _LEFT_OVER, _LEFT_OVER_M_S = 0.5, 0.06
 of 0.1 m/s [m/s]."""
 _MAP_SHARE = 0.15
 """Error of displacements of the map over half a second, as a share of them."""
-_USUALLY_RIGHT = math.log(9.0)
+_PRIOR_LOG_ODDS = math.log(9.0)
 """Log-odds of a column to be right before any motion along its axis."""
 _SURELY_WRONG = 0.999
 """Probability at which a column contradicts the images: no single interval reaches it."""
@@ -163,8 +163,8 @@ def broken_columns(seen: FloatArray, reported: FloatArray, unproven: tuple[float
     left = np.abs(reported - scale * seen)
     kept = np.sort(left, axis=0)[: int(_KEPT * len(left))]
     speed = np.sqrt(np.maximum(np.mean(reported**2, axis=0), scale**2 * np.mean(seen**2, axis=0)))
-    apart = np.sqrt(np.mean(kept**2, axis=0)) > np.maximum(_LEFT_OVER * speed, _LEFT_OVER_M_S)
-    return tuple(name for name, is_apart in zip(VELOCITY, (apart | wrong).tolist(), strict=True) if is_apart)
+    deviates = np.sqrt(np.mean(kept**2, axis=0)) > np.maximum(_LEFT_OVER * speed, _LEFT_OVER_M_S)
+    return tuple(name for name, off in zip(VELOCITY, (deviates | wrong).tolist(), strict=True) if off)
 
 
 def unproven_columns(seen: FloatArray, reported: FloatArray) -> tuple[float, ...]:
@@ -182,7 +182,7 @@ def unproven_columns(seen: FloatArray, reported: FloatArray) -> tuple[float, ...
         np.sum(np.minimum((reported - x) ** 2 / variance, _WINSOR**2), axis=0)
         for x in (expected, -expected, reported.mean(axis=0))
     )
-    log_odds = _USUALLY_RIGHT + 0.5 * (np.minimum(mirrored, frozen) - right)
+    log_odds = _PRIOR_LOG_ODDS + 0.5 * (np.minimum(mirrored, frozen) - right)
     return tuple(expit(-log_odds).tolist())
 
 
@@ -323,7 +323,7 @@ class SensorGate:
         said = [] if self.reread is None else [self.reread.warning(velocity)]
         attitude = self.latest.get(Reading.ATTITUDE)
         if attitude is not None and self.verdict(Reading.ATTITUDE) is Verdict.CONTRADICTS:
-            said.append(f"telemetry's velocities are not used, nor its heights and attitude: {_apart(attitude)}")
+            said.append(f"telemetry's velocities are not used, nor its heights and attitude: {_deviation(attitude)}")
         elif velocity is not None and not self.velocity:
             said.append(f"telemetry's velocities are not used: {_why(velocity, 'motion')}")
         if velocity is not None and self.velocity and not self.tells_scale and velocity.count >= _TO_CONTRADICT:
@@ -338,7 +338,7 @@ class SensorGate:
         return said
 
 
-def _apart(found: Agreement) -> str:
+def _deviation(found: Agreement) -> str:
     """Size of the deviation between attitude and images."""
     if not found.broken:
         return f"roll, pitch and yaw explain {100 * found.share:.0f} % of the turns in the images"

@@ -137,11 +137,11 @@ class EdgeMap:
 
     def _keypoint_z(self, keyframe: Keyframe) -> FloatArray:
         """Depth ``(N,)`` of a keyframe's triangulated anchors at their keypoints, NaN elsewhere."""
-        held = keyframe.keypoints_with_anchor()
-        triangulated = ~self.map.anchors.from_depth[keyframe.anchor[held]]
-        held = held[triangulated]
+        with_anchor = keyframe.keypoints_with_anchor()
+        triangulated = ~self.map.anchors.from_depth[keyframe.anchor[with_anchor]]
+        with_anchor = with_anchor[triangulated]
         z = np.full(len(keyframe.anchor), np.nan)
-        z[held] = se3.transform(keyframe.T_c_w, self.map.anchors.p_w[keyframe.anchor[held]])[:, 2]
+        z[with_anchor] = se3.transform(keyframe.T_c_w, self.map.anchors.p_w[keyframe.anchor[with_anchor]])[:, 2]
         z[z <= 0] = np.nan
         return z
 

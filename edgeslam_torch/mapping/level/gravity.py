@@ -63,8 +63,8 @@ def best_known(by_gravity: Up | None, by_edges: Up | None) -> Up | None:
     if by_gravity is None or by_edges is None:
         return by_gravity or by_edges
     sigma = math.hypot(by_gravity.sigma_rad, by_edges.sigma_rad)
-    apart = math.acos(float(np.clip(by_gravity.direction @ by_edges.direction, -1.0, 1.0)))
-    if apart > _CONTRADICTION * sigma:
+    angle_rad = math.acos(float(np.clip(by_gravity.direction @ by_edges.direction, -1.0, 1.0)))
+    if angle_rad > _CONTRADICTION * sigma:
         return by_gravity  # edges may confuse the axes of a room, gravity cannot
     weights = np.array([by_gravity.sigma_rad, by_edges.sigma_rad]) ** -2.0
     both = weights[0] * by_gravity.direction + weights[1] * by_edges.direction

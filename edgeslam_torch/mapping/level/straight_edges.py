@@ -37,12 +37,12 @@ _ACROSS_RAD = math.radians(1.5)
 _BLURS = (4.0, 3.0, 2.0, 1.5, *[1.0] * 8)
 """Factors on these sigmas in the steps of a refinement, coarse to fine for a wide basin of convergence."""
 _CANDIDATES = 1500
-_APART = math.cos(math.radians(12.0))
+_MERGED_COS = math.cos(math.radians(12.0))
 """Candidates at smaller angles are merged."""
-_ELSEWHERE = math.cos(math.radians(30.0))
+_DISTINCT_COS = math.cos(math.radians(30.0))
 """Candidates at larger angles are different axes."""
 
-_ROLL_RAD, _PITCH_RAD, _USUAL_PITCH_RAD = math.radians(15.0), math.radians(30.0), math.radians(-10.0)
+_ROLL_RAD, _PITCH_RAD, _MEAN_PITCH_RAD = math.radians(15.0), math.radians(30.0), math.radians(-10.0)
 """Prior of a camera's attitude: standard deviations of roll and pitch, and mean pitch (cameras look slightly down)."""
 _ANY_WAY = 0.1
 """Share of cameras in any other attitude, such as rotated phones."""
@@ -124,7 +124,7 @@ def vertical(segments: Segments, R_w_c: FloatArray, focal_sigma: float = 0.0) ->
     candidates = [v if v @ image_up >= 0 else -v for v in candidates]
     likely = np.array([_likelihood(v, segments, R_w_c) for v in candidates])
     axes = np.stack(candidates)
-    same = np.abs(axes @ axes[int(likely.argmax())]) >= _ELSEWHERE
+    same = np.abs(axes @ axes[int(likely.argmax())]) >= _DISTINCT_COS
     rivals = likely[~same]
     support = _support(axes, segments)
     best = axes[int(np.where(same, support.along + support.square, -1.0).argmax())]
@@ -243,7 +243,7 @@ def _peaks(v: FloatArray, support: FloatArray, most: int = 8) -> list[FloatArray
     peaks: list[FloatArray] = []
     while len(peaks) < most and left.max() > 0:
         peaks.append(v[int(left.argmax())])
-        left[np.abs(v @ peaks[-1]) > _APART] = 0.0
+        left[np.abs(v @ peaks[-1]) > _MERGED_COS] = 0.0
     return peaks
 
 
@@ -266,8 +266,8 @@ def _likelihood(v: FloatArray, segments: Segments, R_w_c: FloatArray) -> float:
     about = float(np.mean((turns @ v) ** 2) / max(float(np.mean(turns**2)), 1e-12))
     roll = np.arcsin(np.clip(R_w_c[:, :, 0] @ v, -1.0, 1.0))
     pitch = np.arcsin(np.clip(R_w_c[:, :, 2] @ v, -1.0, 1.0))
-    held = np.exp(-0.5 * ((roll / _ROLL_RAD) ** 2 + ((pitch - _USUAL_PITCH_RAD) / _PITCH_RAD) ** 2))
-    return (_ANY_WAY + float(held.mean())) * (about + 0.01) * float(_support(v[None], segments).across[0])
+    likelihood = np.exp(-0.5 * ((roll / _ROLL_RAD) ** 2 + ((pitch - _MEAN_PITCH_RAD) / _PITCH_RAD) ** 2))
+    return (_ANY_WAY + float(likelihood.mean())) * (about + 0.01) * float(_support(v[None], segments).across[0])
 
 
 def _jackknife(best: FloatArray, segments: Segments) -> float:

@@ -13,7 +13,7 @@ PUSHED_M_S = 0.15
 _STANDS_M_S, _PUSH_S = 0.04, 1.5
 _PAUSE_S = 0.5
 """Gap between calls after which the detection restarts: other commands were sent meanwhile."""
-_TOLD_M_S = 0.1
+_REPORTED_STEP_M_S = 0.1
 """Quantisation step of a Tello's reported velocity: lower speeds read 0."""
 
 
@@ -43,7 +43,7 @@ class Push:
         """
         turned = towards_w is not None and float(towards_w @ self._towards_w) < 0.0
         speed = float(np.linalg.norm(state.velocity_w[:2]))
-        stands = state.reported_speed_m_s < _TOLD_M_S  # false for NaN
+        stands = state.reported_speed_m_s < _REPORTED_STEP_M_S  # false for NaN
         if towards_w is None or turned or (speed > _STANDS_M_S and not stands):
             self._since_s, self._towards_w = math.nan, np.zeros(2) if towards_w is None else towards_w
             return False

@@ -23,7 +23,7 @@ _LARGE_M2 = 0.5
 """Smaller non-free regions are furniture, not walls."""
 _SMOOTH_CELLS = 2.0
 """Smoothing of the free space for border normals [cells]."""
-_APART_M, _APART_RAD = 0.2, math.radians(8.0)
+_SAME_VIEW_M, _SAME_VIEW_RAD = 0.2, math.radians(8.0)
 """Views closer than both of these are redundant."""
 
 
@@ -79,8 +79,8 @@ class Coverage:
         """Add the current view; dead-reckoned poses are left out."""
         if not state.tracked:
             return
-        near = np.linalg.norm(self._places.p_w - state.p_w[:2], axis=1) < _APART_M
-        similar = np.abs(wrapped(self._headings - state.yaw_rad)) < _APART_RAD
+        near = np.linalg.norm(self._places.p_w - state.p_w[:2], axis=1) < _SAME_VIEW_M
+        similar = np.abs(wrapped(self._headings - state.yaw_rad)) < _SAME_VIEW_RAD
         if not (near & similar).any():
             self._places.add(state.views, state.p_w[:2])
             self._headings = np.append(self._headings, state.yaw_rad)

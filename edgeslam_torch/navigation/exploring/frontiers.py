@@ -56,13 +56,13 @@ class Looks:
     """Frontiers that the drone was near to."""
     _spent_s: list[float] = field(default_factory=list)
     """Time spent near each [s]."""
-    _asked_s: float = math.nan
+    _last_call_s: float = math.nan
     _nothing_s: float = math.nan
 
     def worth(self, cells: np.ndarray, layer: Layer, state: DroneState) -> np.ndarray:
         """Cells ``(G, 2)`` not yet inspected without success; call it at every plan."""
-        passed = 0.0 if math.isnan(self._asked_s) else min(state.stamp_s - self._asked_s, 1.0)
-        self._asked_s = state.stamp_s
+        passed = 0.0 if math.isnan(self._last_call_s) else min(state.stamp_s - self._last_call_s, 1.0)
+        self._last_call_s = state.stamp_s
         places = layer.centres(cells).reshape(-1, 2)
         for place in places[np.linalg.norm(places - state.p_w[:2], axis=1) < _NEAR_M]:
             self._spend(place, passed, state)

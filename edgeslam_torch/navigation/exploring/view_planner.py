@@ -193,9 +193,9 @@ def _informative(opening: Candidate, p_w: FloatArray, inside_m: float = 0.0) -> 
     ``inside_m`` inside this region, and away from saturated viewpoints."""
     before = (opening.centre_w - p_w) @ opening.normal_w
     aside = np.abs((p_w - opening.centre_w) @ np.array([-opening.normal_w[1], opening.normal_w[0]]))
-    apart = (before >= _BEFORE_M[0] + inside_m) & (before <= _BEFORE_M[1] - inside_m)
+    in_range = (before >= _BEFORE_M[0] + inside_m) & (before <= _BEFORE_M[1] - inside_m)
     fresh = np.linalg.norm(p_w[:, None] - opening.saturated_w, axis=-1).min(axis=1, initial=math.inf)
-    return np.asarray(apart & (aside <= _ASIDE * before - inside_m) & (fresh >= PLACES_M + inside_m))
+    return np.asarray(in_range & (aside <= _ASIDE * before - inside_m) & (fresh >= PLACES_M + inside_m))
 
 
 def _in_turn(turns_rad: list[float]) -> list[float]:

@@ -152,7 +152,7 @@ class _Track:
 
     @property
     def places(self) -> int:
-        """Number of viewpoints that speak for it."""
+        """Number of viewpoints whose evidence is positive."""
         return sum(log_odds > 0.0 for log_odds in self._evidence)
 
     @property

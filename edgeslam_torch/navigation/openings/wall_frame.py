@@ -14,7 +14,7 @@ CELL_SIGMAS = 1.0 / math.sqrt(6.0)
 REACH_M = 6.0
 """Half side of the grid; beyond it depth does not resolve a wall."""
 _STEP_RAD = math.radians(3.0)
-_APART_RAD = math.radians(12.0)
+_DISTINCT_RAD = math.radians(12.0)
 """Minimum angle between distinct wall directions."""
 _DIRECTIONS = 2
 """Number of directions; each also yields its perpendicular, since a corridor's end wall is too short to be detected."""
@@ -100,7 +100,7 @@ def wall_directions(walls: Walls, centre_w: FloatArray) -> list[float]:
         if score[k] < 0.25 * score.max() or len(found) == 2 * _DIRECTIONS:
             break
         off = [abs((angles[k] - other + math.pi / 4) % (math.pi / 2) - math.pi / 4) for other in found]
-        if all(a > _APART_RAD for a in off):
+        if all(a > _DISTINCT_RAD for a in off):
             found += [float(angles[k]), float((angles[k] + math.pi / 2) % math.pi)]
     return found
 

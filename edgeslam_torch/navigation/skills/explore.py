@@ -31,7 +31,7 @@ class Explore(Skill):
         return found if len(found) else borders
 
     def result(self, state: DroneState, losses: int = 0) -> Result | None:
-        """Nothing is left; losses end it nowhere, since other places are left."""
+        """Reached when nothing is left to explore; tracking losses do not end it, since other places remain."""
         if self._looks.over(state.stamp_s):
             return Result(True, "nothing is left to explore")
         return super(Explore, self).result(state)

@@ -49,8 +49,8 @@ class ReturnHome(Skill):
             self._track.add(state.views, self.track_w, nearest=True)
         points = np.concatenate([np.zeros((1, 2)), self._track.p_w])
         at = (points - layer.corner_w) / layer.cell_m
-        held = ((at >= 1) & (at < np.array(layer.free.shape) - 1)).all(1)
-        oldest = points[int(np.argmax(held))] if held.any() else state.p_w[:2]
+        inside = ((at >= 1) & (at < np.array(layer.free.shape) - 1)).all(1)
+        oldest = points[int(np.argmax(inside))] if inside.any() else state.p_w[:2]
         return layer.cells(oldest)[None]
 
     def result(self, state: DroneState, losses: int = 0) -> Result | None:

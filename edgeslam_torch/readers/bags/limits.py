@@ -161,7 +161,7 @@ def _check_length(stream: BinaryIO, most: int, file: Path) -> None:
 
 
 def check_definition_text(text: str, topic: str, idl: bool) -> None:
-    """Refuse a message definition whose parsing or constants could take for ever.
+    """Refuse a message definition whose parsing or constants might not terminate.
 
     Raises:
         SourceError: If it is longer than any real one, or computes its constants.

@@ -79,7 +79,7 @@ COURSES = {
     "turn_first": Course(pilot=partial(fly_after_hover, turning=True)),
     "hover_first": Course(pilot=fly_after_hover),
 }
-"""By name. ``block`` and ``building`` go once around, 40 m, and 5 m on over ground that they know."""
+"""By name. ``block`` and ``building`` go once around, 40 m, and 5 m on along the path flown before."""
 
 DEPTH_EVERY = 10
 """Frames from one exact depth map to the next."""

@@ -167,7 +167,7 @@ def fly_around(
     """Along a rectangle around the origin, again and again, looking ahead; the second round begins as the first did.
 
     Args:
-        rng: Of height, distance from the line, glances to the side and unrest.
+        rng: Of height, distance from the line, glances to the side and jitter.
         world: With free air along the rectangle.
         frames: Length of the flight.
         rate_hz: Frames a second.
@@ -250,7 +250,7 @@ def _sampled(
     padded = np.vstack([np.repeat(control[:1], DEGREE, axis=0), control, np.repeat(control[-1:], DEGREE, axis=0)])
     knots = (np.arange(len(padded) + DEGREE + 1) - DEGREE) * KNOT_S
     spline = BSpline(knots, padded, DEGREE)
-    # Sum of a few sines: the drone's own unrest, smooth and zero at the start.
+    # Sum of a few sines: the drone's jitter, smooth and zero at the start.
     flown = stamps + begin_s
     fade = 1.0 - np.exp(-((flown / 1.5) ** 2))
     state, velocity, acceleration = (spline(flown, nu=k) for k in range(3))

@@ -50,7 +50,7 @@ def simulate_imu(
     errors: ImuErrors | None = None,
     knots_s: float | None = None,
 ) -> ImuReadings:
-    """Readings of an IMU that is carried along with the camera.
+    """Readings of an IMU mounted rigidly to the camera.
 
     Args:
         rng: Noise.

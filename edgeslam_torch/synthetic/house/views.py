@@ -148,7 +148,7 @@ def _close_up(rng: Rng, world: World, ceiling_m: float) -> FloatArray | None:
 def random_view(rng: Rng, camera: Camera, world: World | None = None) -> Rendered:
     """An exact view from a sensible place of ``world`` (a new `random_room` if None).
 
-    A quick look at 40 x 30 pixels rejects views that stare at something nearer than arm's length.
+    A preview of 40 x 30 pixels rejects views of something nearer than arm's length.
     """
     world = world or random_room(rng)
     small = replace(camera, distortion=(0.0,) * 5).scaled(40, 30)

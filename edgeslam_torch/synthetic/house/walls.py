@@ -43,7 +43,7 @@ def shell(
         high: ``(3,)`` the other.
         texel_m: Size of a texel.
         walls: Materials to choose from.
-        one_paint: Whether all walls are painted alike.
+        one_paint: Whether all walls have the same paint.
     """
     scene = Scene(low, high, texel_m)
     wide, deep, tall = high - low

@@ -118,7 +118,7 @@ class Glass:
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """Somebody who walks to and fro along x or y."""
+    """A person who walks to and fro along x or y."""
 
     x: Number | Extent
     y: Number | Extent
@@ -143,7 +143,7 @@ class SceneFile:
     pieces: tuple[str, ...] = tuple(PIECES)
     """Furniture to choose from; what stands twice is twice as frequent."""
     one_paint: bool = False
-    """Whether all outer walls are painted alike."""
+    """Whether all outer walls have the same paint."""
     random_lamps: bool = False
     start: tuple[Number, Number, Number] | None = None
     """x, y and heading [degrees]."""
