@@ -28,8 +28,12 @@ VELOCITY_TRUNCATED_SCALE_LOG = 0.015
 
 ATTITUDE_RAD = math.radians(0.36)
 """Of one reading: 1 deg / sqrt(12) of quantisation, which repeats in hover."""
+FIRST_ATTITUDE_RAD = math.radians(1.0)
+"""Of the first attitude, per axis: whole degrees, and the drift since power-on."""
 ATTITUDE_WALK_RAD_SQRT_S = 0.05
 """Random walk of the angles between readings; set so that rotation errors match their covariance."""
+MOUNT_RAD = math.radians(3.0)
+"""Of the camera's mount, per axis, until it is estimated from rotations."""
 UP_RAD = math.radians(2.0)
 """Of the direction of gravity in one frame: mount, and acceleration taken for gravity."""
 LEVEL_RAD = math.radians(1.0)

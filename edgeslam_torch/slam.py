@@ -45,6 +45,7 @@ from edgeslam_torch.mapping.level.gravity import best_known, up_by_gravity
 from edgeslam_torch.mapping.level.straight_edges import up_by_edges
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.mapping.pipeline import MappingPipeline
+from edgeslam_torch.noise import MOUNT_RAD
 from edgeslam_torch.states.machine import Machine, State
 from edgeslam_torch.states.map_merging import MapMerging
 from edgeslam_torch.states.starting import FIRST_FRAME, Starting
@@ -330,7 +331,7 @@ class EdgeSlam:
             self.up = Up(np.array([0.0, 0.0, 1.0]), felt_up[1], "imu")
             return
         if system.published.upright and (not self._earlier.pieces or system.fusion.orientation.began_upright):
-            self.up = Up(np.array([0.0, 0.0, 1.0]), self.config.fusion.alignment_sigma_rad, "telemetry")
+            self.up = Up(np.array([0.0, 0.0, 1.0]), MOUNT_RAD, "telemetry")
             return
         shown = self._shown_keyframes()
         by_edges = up_by_edges(shown, self.edges.hosts, self.camera)

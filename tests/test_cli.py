@@ -120,7 +120,7 @@ MISTAKES = [
     (["run", "{seq}", "--config", "{tmp}/c.toml"], 1, "c.toml: No such file"),
     (["run", "{seq}", "--set", "orb.feature=3"], 1, "did you mean 'orb.features'"),
     (["run", "{seq}", "--set", "orb.features=0"], 1, "features must be positive"),
-    (["run", "{seq}", "--set", "fusion.alignment_sigma_rad=0"], 1, "alignment_sigma_rad must be positive"),
+    (["run", "{seq}", "--set", "fusion.velocity_step_m_s=0"], 1, "velocity_step_m_s must be positive"),
     (["run", "{seq}", "--out", "{seq}"], 1, "is the source itself"),
     (["run", "{seq}", "--out", "{seq}/rgb.txt/x"], 1, "cannot write results there"),
     (["run", "{seq}", "--max-frames", "0"], 2, "must be a whole number of at least 1, got '0'"),

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.config import INTERVAL_S, MAX_GAP_S, WINDOW_S, FusionConfig
 from edgeslam_torch.estimation.dead_reckoning import REACH_S as RECKONED_S
 from edgeslam_torch.estimation.dead_reckoning import Reckoned, reckoned
 from edgeslam_torch.estimation.displacement import TelemetryModel
@@ -70,8 +70,8 @@ class MotionFusion:
         """Returns stamps and poses of the frames since a stamp, in the present map; called before each fit."""
         self.flight = Remembered(
             config,
-            TelemetryTrack(config.velocity_frame, config.max_gap_s),
-            VisualMemory(config.interval_s, config.window_s, config.max_gap_s),
+            TelemetryTrack(config.velocity_frame, MAX_GAP_S),
+            VisualMemory(INTERVAL_S, WINDOW_S, MAX_GAP_S),
             DelaySearch(config, given[:3, :3]),
             SensorGate(),
         )
@@ -122,7 +122,7 @@ class MotionFusion:
         visual = VisualPose(stamp_s, np.array(T_w_c, dtype=np.float64), sigma_t, sigma_r_rad)
         self._memory.add(visual)
         if self._is_due(stamp_s) or (stamp_s - self._fitted_s >= _FIRST_FIT_S and self.orientation.has_diverged()):
-            self._remember_refined(stamp_s, self.config.window_s)
+            self._remember_refined(stamp_s, WINDOW_S)
             self._refit()
         elif self.metres.sensor_scale is not None and stamp_s - self._remembered_s >= _REFIT_S:
             self._remember_refined(stamp_s, RECKONED_S)
@@ -209,8 +209,8 @@ class MotionFusion:
         """Metres per map unit along some frames of the flight, ``(F,)`` and ``(F, 4, 4)``; None without telemetry."""
         if len(stamps_s) == 0:
             return None
-        length_s = float(stamps_s[-1] - stamps_s[0]) + self.config.window_s
-        memory = VisualMemory(self.config.interval_s, length_s, self.config.max_gap_s)
+        length_s = float(stamps_s[-1] - stamps_s[0]) + WINDOW_S
+        memory = VisualMemory(INTERVAL_S, length_s, MAX_GAP_S)
         for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
             memory.add(VisualPose(stamp_s, T, VISUAL_SIGMA, VISUAL_SIGMA))
         return self._scale_of(memory.displacements())
@@ -382,7 +382,7 @@ class MotionFusion:
     def _is_due(self, stamp_s: float) -> bool:
         known = self.metres.sensor_scale is not None and math.isfinite(self.flight.delay_sigma_s)
         first_s = _REFIT_S if known else _FIRST_FIT_S
-        pause_s = max(first_s, _REFIT_SHARE * min(self._memory.length_s, self.config.window_s))
+        pause_s = max(first_s, _REFIT_SHARE * min(self._memory.length_s, WINDOW_S))
         return len(self._track) > 0 and (self.orientation.found is None or stamp_s - self._fitted_s >= pause_s)
 
     def _refit(self, flying: bool = True) -> None:

@@ -10,7 +10,7 @@ from edgeslam_torch.estimation.sensors.attitude import is_steady
 from edgeslam_torch.estimation.telemetry.alignment import LATELY, attitudes, map_to_world
 from edgeslam_torch.estimation.telemetry.comparison import MAX_DEVIATION_RAD
 from edgeslam_torch.geometry.rotations import rotation_vector
-from edgeslam_torch.noise import DELAY_S, STAMP_S
+from edgeslam_torch.noise import DELAY_S, MOUNT_RAD, STAMP_S
 from edgeslam_torch.types import FloatArray
 
 _TURNED_S = 5.0
@@ -66,7 +66,7 @@ class Orientation:
         pairs = attitudes(flight.memory.sightings(), flight.track, flight.delay_s)
         if pairs is None:
             return None
-        R_b_c, sigma_rad = self.given[:3, :3], flight.config.alignment_sigma_rad
+        R_b_c, sigma_rad = self.given[:3, :3], MOUNT_RAD
         if flight.trust.turns:
             return mount_by_turns(pairs.R_m_c, pairs.R_w_b, pairs.stamp_s, R_b_c, sigma_rad)
         return Turned(R_b_c, pairs.map_to_world(R_b_c), np.full(3, sigma_rad))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.config import MAX_GAP_S, MIN_SPEED_M_S, FusionConfig
 from edgeslam_torch.estimation.scale.belief import ScaleBelief, contradict
 from edgeslam_torch.estimation.scale.camera_mount import Turned
 from edgeslam_torch.estimation.scale.evidence import (
@@ -42,6 +42,7 @@ from edgeslam_torch.noise import (
     HEIGHT_SCALE_LOG,
     HEIGHT_STEP_M,
     MAP_WANDER_LOG,
+    MOUNT_RAD,
     VELOCITY_M_S,
     VELOCITY_SCALE_LOG,
     VELOCITY_TRUNCATED_SCALE_LOG,
@@ -266,7 +267,7 @@ class TelemetryScale:
 
     def _compared(self) -> _Shown | None:
         """Intervals in which the drone moves."""
-        track, config, memory = self._present.track, self._config, self._present.memory
+        track, memory = self._present.track, self._present.memory
         moved = memory.displacements()
         moved = in_common(moved, track, self._delay_s).joined()
         if len(moved) < 2:
@@ -280,7 +281,7 @@ class TelemetryScale:
         if min(ways) <= 0.0:
             return None
         seen = memory.sightings()
-        velocity = seen_velocity(track, seen, self._delay_s, self._R_w_m, self._T_b_c, config.max_gap_s)
+        velocity = seen_velocity(track, seen, self._delay_s, self._R_w_m, self._T_b_c, MAX_GAP_S)
         return _Shown(moved, moved_m, velocity, math.sqrt(ways[0] / ways[1]))
 
     def _moving(self, moved: Displacements, moved_m: FloatArray) -> np.ndarray:
@@ -289,11 +290,10 @@ class TelemetryScale:
             speed = np.linalg.norm(moved.moved, axis=1) * self._previous / moved.duration_s
         else:
             speed = np.linalg.norm(moved_m, axis=1) / moved.duration_s
-        return speed > self._config.min_speed_m_s
+        return speed > MIN_SPEED_M_S
 
     def _by_height(self, scale: float, moved: Evidence | None) -> Evidence | None:
         """Evidence from the most accurate of range sensor, SDK height and barometer: they observe the same motion."""
-        config = self._config
         seen = self._present.memory.sightings()
         stamps_s = seen.stamps_s - self._delay_s
         lever = -seen.T[:, :3, :3] @ (self._T_b_c[:3, :3].T @ self._T_b_c[:3, 3])  # from camera to body [m]
@@ -306,7 +306,7 @@ class TelemetryScale:
             # Interpolate poses at readings, not readings at poses: each reading counts once.
             here = (times >= stamps_s[0]) & (times <= stamps_s[-1])
             near = np.clip(np.searchsorted(stamps_s, times), 1, len(stamps_s) - 1)
-            here &= stamps_s[near] - stamps_s[near - 1] < config.max_gap_s
+            here &= stamps_s[near] - stamps_s[near - 1] < MAX_GAP_S
             if here.sum() < 2:
                 continue
             p = np.stack([np.interp(times[here], stamps_s, p_w[:, k]) for k in range(3)], axis=1)
@@ -373,10 +373,10 @@ def scale_of(
     if not len(moved):
         return None
     reported = camera_moved(moved, track, T_b_c[:3, 3], shortfall_m_s)
-    moving = np.linalg.norm(reported, axis=1) > config.min_speed_m_s * moved.duration_s
+    moving = np.linalg.norm(reported, axis=1) > MIN_SPEED_M_S * moved.duration_s
     moved, reported = moved.only(moving), reported[moving]
     sigma_m = VELOCITY_M_S * np.sqrt(0.1 * moved.duration_s)
-    tilt = config.alignment_sigma_rad
+    tilt = MOUNT_RAD
     evidence = displacement_evidence(
         moved.moved @ R_w_m.T, reported, moved.from_s, moved.duration_s, moved.sigma, sigma_m, tilt
     )

@@ -3,6 +3,7 @@ import pytest
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.filter.delayed import BufferedEkf, PoseSigma
+from edgeslam_torch.estimation.filter.ekf import RECOVERS_AFTER
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import TelemetrySample
 
@@ -85,7 +86,7 @@ def test_vision_that_disagrees_for_long_is_believed_in_the_end(rng):
         if k >= 20:
             ekf.add_relative(0.1 * (k - 1), 0.1 * k, T, PoseSigma(0.004, 0.003))
     counts = ekf.statistics()
-    assert counts["visual refused"] >= CONFIG.refusals_before_recovery - 1
+    assert counts["visual refused"] >= RECOVERS_AFTER - 1
     assert counts["visual recovered"] >= 1
     assert ekf.state_at(3.9).p_w[0] > 1.0
 

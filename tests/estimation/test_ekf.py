@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.estimation.config import FusionConfig
-from edgeslam_torch.estimation.filter.ekf import Ekf, Outcome
+from edgeslam_torch.estimation.filter.ekf import RECOVERS_AFTER, Ekf, Outcome
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.rotations import (
     euler_rate_matrix,
@@ -69,8 +69,9 @@ def test_body_velocity_is_turned_into_the_world_as_paper_equation_9_says():
 
 
 def test_literal_process_noise_is_paper_equation_10_by_hand():
-    config = FusionConfig(literal=True, literal_beta=0.01, lambda_tau=0.5, initial_sigma_angle_rad=0.0)
+    config = FusionConfig(literal=True, literal_beta=0.01, lambda_tau=0.5)
     ekf = Ekf(config)
+    ekf.P[:] = 0.0
     ekf.predict(0.1, np.zeros(3), battery=0.6)  # beta (1 - b + lambda tau) = 0.01 (0.4 + 0.05)
     np.testing.assert_allclose(ekf.state(0.1).covariance, 0.0045 * np.eye(6), atol=1e-15)
 
@@ -112,8 +113,8 @@ def test_literal_filter_does_not_wrap_and_swings_through_zero():
 def test_gate_refuses_a_jump_and_recovers_when_it_stays():
     ekf = Ekf(CONFIG)
     wrong = np.array([0.0, 0.0, 0.8])
-    outcomes = [ekf.update_attitude(wrong) for _ in range(CONFIG.refusals_before_recovery)]
-    assert outcomes[:-1] == [Outcome.REFUSED] * (CONFIG.refusals_before_recovery - 1)
+    outcomes = [ekf.update_attitude(wrong) for _ in range(RECOVERS_AFTER)]
+    assert outcomes[:-1] == [Outcome.REFUSED] * (RECOVERS_AFTER - 1)
     assert outcomes[-1] is Outcome.RECOVERED
     assert abs(ekf.state(0.0).rpy_rad[2] - 0.8) < 0.1
 
@@ -132,9 +133,11 @@ def test_not_finite_measurements_change_nothing():
     assert np.isfinite(ekf.P).all()
 
 
-def test_exact_relative_poses_lead_along_the_true_path(rng):
+def test_exact_relative_poses_lead_along_the_true_path(rng, monkeypatch):
     # Sure of its attitude: velocities would correct it. At 95 % the gate refuses three of sixty good ones.
-    ekf = Ekf(FusionConfig(gate_probability=0.9999, initial_sigma_angle_rad=0.0))
+    monkeypatch.setattr("edgeslam_torch.estimation.filter.ekf._GATE", {3: 21.1, 6: 27.9})
+    ekf = Ekf(CONFIG)
+    ekf.P[3:6, 3:6] = 0.0
     truth = pose([0.0, 0.0, 0.0], [0.0, 0.0, 0.3])
     ekf.reset_pose(truth[:3, 3], np.array([0.0, 0.0, 0.3]))
     for _ in range(60):
@@ -209,10 +212,8 @@ def test_gate_is_the_95_percent_quantile(degrees, share, outcome):
     [
         {"velocity_step_m_s": 0.0},
         {"beta": -1.0},
-        {"gate_probability": 1.0},
         {"delay_range_s": (1.0, 0.0)},
         {"velocity_frame": "camera"},
-        {"refusals_before_recovery": 0},
     ],
 )
 def test_settings_out_of_range_are_refused_by_name(wrong):

@@ -13,6 +13,8 @@ from edgeslam_torch.geometry.rotations import rpy_from_matrix, wrapped
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
 _TELEMETRY, _RELATIVE, _ABSOLUTE, _CLONE = range(4)
+_BUFFER_S = 3.0
+"""Maximum age of a late measurement that is still inserted in time order."""
 _SAME_S = 1e-6
 _SILENCE_S = 0.5
 """Maximum gap between readings for interpolation."""
@@ -62,7 +64,7 @@ class _Event:
 
 
 class BufferedEkf:
-    """`Ekf` with a clock: measurements of the last ``config.buffer_s`` may arrive in any order.
+    """`Ekf` with a clock: measurements of the last three seconds may arrive in any order.
 
     A late measurement is inserted among the buffered events; the filter is restored to the state before it and later
     events are applied again. Velocities and angles between two readings are interpolated once both have arrived.
@@ -284,7 +286,7 @@ class BufferedEkf:
         return f"{kind} {outcome.value}"
 
     def _forget(self) -> None:
-        horizon = self._events[-1].stamp_s - self.config.buffer_s
+        horizon = self._events[-1].stamp_s - _BUFFER_S
         keep = bisect.bisect_left(self._events, horizon, key=lambda e: e.stamp_s)
         for event in self._events[:keep]:
             if event.outcome:

@@ -30,6 +30,7 @@ from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.noise import (
     ATTITUDE_RAD,
     ATTITUDE_WALK_RAD_SQRT_S,
+    FIRST_ATTITUDE_RAD,
     POSITION_FLOOR_M_SQRT_S,
     VELOCITY_BIAS_WALK_M_S_SQRT_S,
     VELOCITY_M_S,
@@ -41,6 +42,10 @@ _POSE, _CLONE = slice(0, 6), slice(9, 15)
 _CLONE_P, _CLONE_A = slice(9, 12), slice(12, 15)
 _SIZE = 15
 _NO_RATE = np.zeros(3)
+_GATE = {n: float(chdtri(n, 0.05)) for n in (3, 6)}
+"""Normalised innovation squared of attitude and of vision beyond which a measurement is refused: 95 %."""
+RECOVERS_AFTER = 5
+"""Refusals in a row after which the covariance is inflated and the measurement taken."""
 _BLIND_S = 0.5
 """Time without vision after which zero readings are taken as hover; longer than a late video's gap."""
 
@@ -97,7 +102,7 @@ class Ekf:
         self.config = config
         self.x: FloatArray = np.zeros(_SIZE)
         self.P: FloatArray = np.zeros((_SIZE, _SIZE))
-        self.P[range(3, 6), range(3, 6)] = config.initial_sigma_angle_rad**2
+        self.P[range(3, 6), range(3, 6)] = FIRST_ATTITUDE_RAD**2
         if config.sigma_bias_m_s > 0 and not config.literal:
             self.P[range(6, 9), range(6, 9)] = config.sigma_bias_m_s**2
         self.tau_s = 0.0
@@ -106,7 +111,6 @@ class Ekf:
         """Consecutive refusals of attitude (3 components) and of vision (6)."""
         self.nis = math.nan
         """Normalised innovation squared of the last measurement."""
-        self._gate = {n: float(chdtri(n, 1.0 - config.gate_probability)) for n in (3, 6)}
 
     def reset_pose(self, p_w: FloatArray, rpy_rad: FloatArray) -> None:
         """Start at a given pose with the initial uncertainty."""
@@ -277,9 +281,9 @@ class Ekf:
         gain, weighted = _solved(S, P_Ht, residual)
         self.nis = float(residual.dot(weighted))
         outcome = Outcome.ACCEPTED
-        if not self.config.literal and self.nis > self._gate[n]:
+        if not self.config.literal and self.nis > _GATE[n]:
             self.refused_in_row[n] += 1
-            if self.refused_in_row[n] < self.config.refusals_before_recovery:
+            if self.refused_in_row[n] < RECOVERS_AFTER:
                 return Outcome.REFUSED
             outcome = Outcome.RECOVERED
             # The filter was overconfident: inflate the observed subspace according to the innovation. Inflating all of

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.config import MAX_GAP_S, FusionConfig
 from edgeslam_torch.estimation.filter.delayed import BufferedEkf, PoseSigma
 from edgeslam_torch.estimation.telemetry.delay import Delay
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualPose
@@ -127,7 +127,7 @@ class FilterFeed:
         if seen is None or delay is None:
             return None
         at_s = stamp_s - delay.value_s
-        if not at_s <= self.ekf.telemetry_s + self._config.max_gap_s:
+        if not at_s <= self.ekf.telemetry_s + MAX_GAP_S:
             return None
         since = self.ekf.since_visual(at_s)
         if since is None or not abs(since[0] + delay.value_s - seen.stamp_s) < _SAME_S:

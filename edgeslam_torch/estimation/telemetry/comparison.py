@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.config import MIN_SPEED_M_S, FusionConfig
 from edgeslam_torch.estimation.scale.belief import ScaleBelief
 from edgeslam_torch.estimation.telemetry.alignment import (
     Attitudes,
@@ -31,6 +31,7 @@ from edgeslam_torch.estimation.telemetry.sensor_validation import (
 )
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack, Turn
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory
+from edgeslam_torch.noise import MOUNT_RAD
 from edgeslam_torch.types import FloatArray
 
 _WIDE_DELAYS_S = (-3.0, 3.0)
@@ -139,7 +140,7 @@ class Comparison:
             return Agreement()
         duration = moved.duration_s[:, None]
         reported = camera_moved(moved, track, np.zeros(3))
-        slow = self._config.min_speed_m_s
+        slow = MIN_SPEED_M_S
         least_seen = math.inf if present.rough_scale is None else 2.0 * slow / present.rough_scale
         seen, reported = moved.moved @ R_w_m.T / duration, reported / duration
         found = agreement(seen, reported, least_seen, slow, early=True)
@@ -179,7 +180,7 @@ class Comparison:
 
     def _relative_deviation(self, reported: Attitudes, R_b_c: FloatArray, delay_sigma_s: float) -> FloatArray:
         """Deviation about each axis relative to the allowed one ``(3,)``."""
-        found = attitude_deviation(reported, R_b_c, self._config.alignment_sigma_rad)
+        found = attitude_deviation(reported, R_b_c, MOUNT_RAD)
         share = np.clip(_DEVIATION_SHARE * found.seen, _DEVIATION_RAD, MAX_DEVIATION_RAD)
         late = delay_sigma_s * found.rate
         return np.maximum(found.rms / np.hypot(share, late), found.lately / np.hypot(MAX_DEVIATION_RAD, 2.0 * late))

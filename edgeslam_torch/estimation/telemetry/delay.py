@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.estimation.config import INTERVAL_S, FusionConfig
 from edgeslam_torch.estimation.telemetry.alignment import map_to_world, turns
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, VisualMemory
@@ -80,7 +80,7 @@ class DelaySearch:
         scale = float(np.sum(reported * seen) / max(float(np.sum(seen**2)), 1e-30))
         residual = reported - max(scale, 0.0) * seen
         power = np.sort(np.sum(residual**2, axis=1))[: max(3, int(_KEPT * len(residual)))]
-        sigma = VELOCITY_M_S * math.sqrt(0.1 * self._config.interval_s)
+        sigma = VELOCITY_M_S * math.sqrt(0.1 * INTERVAL_S)
         cost = 1.5 * len(residual) * math.log(float(power.mean()) / 3.0 + 0.25 * sigma**2)
         return cost + self._turn_cost(moved, track)
 
