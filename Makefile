@@ -80,8 +80,13 @@ docs: $(STAMP)
 	@echo "docs: open site/index.html"
 
 # Runs what the documents quote (an hour on two cores; goes on where it was interrupted), and puts it into them.
+CHANGES := no-flow whole-pixels no-depth-network flight-off flight-always literal-cycle literal-total near
+RECORDINGS := tum_fr1_xyz 7scenes_redkitchen euroc_mh05_a fr3_notexture_a
 results: $(STAMP)
 	$(BIN)/edgeslam judge --release docs/results/0.3.json --out runs/release $(JUDGE_ARGS)
+	$(BIN)/edgeslam ablation --seeds 1 --max-frames 300 --out runs/ablation \
+		$(addprefix --row ,$(CHANGES)) $(addprefix --sequence ,$(RECORDINGS))
+	cp runs/ablation/ablation.json docs/results
 	$(BIN)/python docs/building/results_pages.py
 
 # Runs the notebooks and keeps what they show.

@@ -85,8 +85,10 @@ def test_no_link_between_documents_is_broken():
     assert broken == []
 
 
-@pytest.mark.parametrize("page", sorted((ROOT / "docs" / "theory").glob("*.md")), ids=lambda path: path.stem)
-def test_what_the_theory_names_exists(page):
+@pytest.mark.parametrize(
+    "page", [path for path in DOCS if path.parent.name in ("theory", "decisions")], ids=lambda path: path.stem
+)
+def test_what_theory_and_decisions_name_exists(page):
     text = page.read_text(encoding="utf-8")
     for name in re.findall(r"`(edgeslam_torch(?:\.\w+)+)`", text):
         assert resolve_name(name)

@@ -2,7 +2,6 @@
 
 import importlib.util
 import re
-import shlex
 from pathlib import Path
 
 import pytest
@@ -36,9 +35,29 @@ def test_page_is_what_the_release_gives(page):
 
 
 def test_documents_show_all_commands_of_a_release_and_no_others() -> None:
-    shown = [line for page in results_pages.PAGES for line in re.findall(r"^\$ (.+)$", page.read_text("utf-8"), re.M)]
+    pages = [README, *(ROOT / "docs").rglob("*.md")]
+    shown = [line for page in pages for line in re.findall(r"^ *\$ (edgeslam .+)$", page.read_text("utf-8"), re.M)]
     assert set(shown) == set(release.COMMANDS.values())
-    assert all(shlex.split(command)[0] == "edgeslam" for command in shown)
+
+
+ELSEWHERE = re.compile(r"<!-- results: .*?<!-- end -->|^ *```.*?^ *```|`[^`]*`|\]\([^)]*\)", re.DOTALL | re.MULTILINE)
+"""Generated blocks, code and links."""
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs" / "decisions").glob("[0-9]*.md")), ids=lambda page: page.stem)
+def test_figures_of_a_decision_are_generated_or_part_of_what_was_decided(page):
+    text = page.read_text(encoding="utf-8").partition("\n")[2]
+    text = re.sub(
+        r"\*\*Decision\.\*\*.*?(?=\n\*\*)|\[decision \d+|eqs?\. \d+((, | to | and )\d+)*", "", text, flags=re.DOTALL
+    )
+    assert re.findall(r"(?<![\w-])\.?\d[\d.]*(?![\w-])", ELSEWHERE.sub("", text)) == []
+
+
+@pytest.mark.parametrize(
+    "page", [README, *sorted((ROOT / "docs" / "results").glob("*.md"))], ids=lambda page: page.name
+)
+def test_decimals_of_results_are_generated(page):
+    assert re.findall(r"\b\d*\.\d+ ?(?:m|cm|mm|%|ms|MB|s)\b", ELSEWHERE.sub("", page.read_text(encoding="utf-8"))) == []
 
 
 def test_readme_s_python_runs(tmp_path, monkeypatch):

@@ -35,6 +35,8 @@ BOOSTS = {"index.md": 10.0, "start/": 10.0, "guides/": 10.0, "reference/api/": 1
 }
 """Weights of pages in the search by their beginning; all others have 1. A word in a title weighs a thousand times as
 much as in the text: guides precede names of the API only by such factors."""
+WIDE = ("index.md", "results/")
+"""Beginnings of pages whose tables and outputs take the room of the list of contents."""
 _LINK = re.compile(r"(?<=\]\()([^)#\s:]+)(#[^)\s]*)?(?=\))")
 _FENCED = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 
@@ -73,6 +75,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Turn links to where their pages are, set formulas, weigh the page for the search."""
     page.meta["search"] = {"boost": boost(page.file.src_uri)}
+    if page.file.src_uri.startswith(WIDE):
+        page.meta["hide"] = ["toc"]
     markdown = fenced_as_mathml(markdown)
     here = home(page.file.src_uri)
     parts = _FENCED.split(markdown)

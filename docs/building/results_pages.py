@@ -1,7 +1,8 @@
 """Put a release's figures into the documents: ``python docs/building/results_pages.py``.
 
-``docs/results/VERSION.json`` is what ``edgeslam judge --release`` wrote; figures of other systems are those of
-``eval/benchmark/peers.toml``. What stands between ``<!-- results: NAME -->`` and ``<!-- end -->`` is replaced.
+``docs/results/VERSION.json`` is what ``edgeslam judge --release`` wrote, ``ablation.json`` what ``edgeslam ablation``
+did; figures of other systems are those of ``eval/benchmark/peers.toml``. What stands between ``<!-- results: NAME -->``
+and ``<!-- end -->`` is replaced.
 """
 
 import json
@@ -10,10 +11,12 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "docs" / "results"
+ABLATION = RESULTS / "ablation.json"
 PEERS = ROOT / "eval" / "benchmark" / "peers.toml"
 BLOCK = re.compile(r"<!-- results: (\w+) -->(.*?)<!-- end -->", re.DOTALL)
 _DOCUMENTS = (ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md")))
@@ -30,36 +33,47 @@ RECORDINGS = {
 }
 """Runs of the release that are recordings, and their titles."""
 FLIGHTS = {"flight/room": "room", "flight/corridor": "corridor", "flight/block": "once around a block"}
-SHOWN = {"fly": slice(-3, None), "evaluate": slice(0, 14), "plan": slice(None)}
+SHOWN = {"calibrate": slice(-9, None), "fly": slice(-3, None), "evaluate": slice(0, 14), "plan": slice(None)}
 """Lines of a command's output that documents show; the last five of others."""
 Figures = dict[str, list[float]]
 
 
 def newest() -> dict[str, Any]:
     """The latest release's record."""
-    path = max(RESULTS.glob("*.json"), key=lambda p: [int(n) for n in re.findall(r"\d+", p.stem)])
+    path = max(RESULTS.glob("[0-9]*.json"), key=lambda p: [int(n) for n in re.findall(r"\d+", p.stem)])
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def blocks(release: dict[str, Any], peers: Sequence[dict[str, Any]]) -> dict[str, str]:
+def blocks(release: dict[str, Any], ablation: dict[str, Any], peers: Sequence[dict[str, Any]]) -> dict[str, str]:
     """Text of every block by its name."""
+    changed = {name: row["runs"] for name, row in ablation["rows"].items() if row["runs"]}
     outputs = {
         name: _block("\n".join(["```text", command, *lines[SHOWN.get(name, slice(-5, None))], "```"]))
         for name, (command, *lines) in release["outputs"].items()
     }
     runs = release["runs"]
-    return outputs | {
-        "conditions": _conditions(release),
-        "summary": _table(("", "ATE [m]", "map [cm]", "CPU [ORB]", "others: ATE [m], frames"), _summary(runs, peers)),
-        "accuracy": _table(_RECORDING_HEADER, [_accuracy(runs[name], title) for name, title in RECORDINGS.items()]),
-        "map_and_cost": _table(_MAP_HEADER, [_map_and_cost(runs[name], title) for name, title in RECORDINGS.items()]),
-        "telemetry": _table(_SENSOR_HEADER, _with_sensor(runs, "telemetry/rounded")),
-        "imu": _table(_SENSOR_HEADER, _with_sensor(runs, "imu/recorded")),
-        "flights": _table(_FLIGHT_HEADER, [_flight(runs[name], title) for name, title in FLIGHTS.items()]),
-        "peers": _block("\n\n".join(_peers(runs, peers))),
-        "block_caption": _block_caption(runs["flight/block"]),
-        "chance_caption": _chance_caption(runs["hololens_a/perturbed"]),
-    }
+    tables = {f"ablation_{name.replace('-', '_')}": _table(*_ablated(changed, name)) for name in changed}
+    return (
+        outputs
+        | tables
+        | {
+            "conditions": _conditions(release),
+            "summary": _table(
+                ("", "ATE [m]", "map [cm]", "CPU [ORB]", "others: ATE [m], frames"), _summary(runs, peers)
+            ),
+            "accuracy": _table(_RECORDING_HEADER, [_accuracy(runs[name], title) for name, title in RECORDINGS.items()]),
+            "map_and_cost": _table(
+                _MAP_HEADER, [_map_and_cost(runs[name], title) for name, title in RECORDINGS.items()]
+            ),
+            "telemetry": _table(_SENSOR_HEADER, _with_sensor(runs, "telemetry/rounded")),
+            "imu": _table(_SENSOR_HEADER, _with_sensor(runs, "imu/recorded")),
+            "flights": _table(_FLIGHT_HEADER, [_flight(runs[name], title) for name, title in FLIGHTS.items()]),
+            "peers": _block("\n\n".join(_peers(runs, peers))),
+            "block_caption": _block_caption(runs["flight/block"]),
+            "ablation_conditions": _ablation_conditions(ablation),
+            "chance_caption": _chance_caption(runs["hololens_a/perturbed"]),
+        }
+    )
 
 
 _RECORDING_HEADER = ["recording", "runs", "ATE [m]", "live [m]", "SE(3) [m]", "scale error", "stated sigma"]
@@ -121,7 +135,7 @@ def _map_and_cost(f: Figures, title: str) -> list[str]:
     return [
         title,
         _median(f, "frames", "{:.0f}"),
-        _spread(f, "supported_end", "{:.0f} %", 100.0),
+        _spread(f, "supported_end", "{:.0f}", 100.0, unit=" %"),
         _median(f, "map_points", "{:.0f}"),
         _spread(f, "map_median_m", "{:.1f}", 100.0),
         _median(f, "cpu_ms", "{:.0f}"),
@@ -159,7 +173,7 @@ def _peers(runs: dict[str, Figures], peers: Sequence[dict[str, Any]]) -> list[st
     parts = []
     for name, title in RECORDINGS.items():
         f = runs[name]
-        coverage = _spread(f, "supported_end", "{:.0f} %", 100.0)
+        coverage = _spread(f, "supported_end", "{:.0f}", 100.0, unit=" %")
         costs = [_median(f, key, "{:.0f}") for key in ("cpu_ms", "memory_mb")]
         rows = [["**this project**", _spread(f, "ate_m"), coverage, *costs, f"runs: {f['seeds']}; all frames"]]
         for peer in peers:
@@ -185,6 +199,36 @@ def _chance_caption(f: Figures) -> str:
     return f"ATE {_spread(f, 'ate_m')} m over {f['seeds']} perturbed starts"
 
 
+def _ablation_conditions(ablation: dict[str, Any]) -> str:
+    settings = ablation["settings"]
+    return (
+        f"version {ablation['version']}, {ablation['made'][:10]}, the first {settings['max_frames']} frames of each "
+        f"recording, runs: {len(settings['seeds'])}"
+    )
+
+
+def _ablated(rows: dict[str, list[dict[str, Any]]], name: str) -> tuple[list[str], list[list[str]]]:
+    """Header and lines of a table: the default's runs, and those of a row with one change."""
+    recordings = list(dict.fromkeys(run["sequence"] for run in rows[name]))
+    lines = [
+        [
+            title,
+            *(
+                _ablated_run([r["figures"] for r in rows[row] if r["sequence"] == recording])
+                for recording in recordings
+            ),
+        ]
+        for title, row in (("default", "default"), ("changed", name))
+    ]
+    return ["ATE [m]; map [cm]", *(RECORDINGS[recording].split(",")[0] for recording in recordings)], lines
+
+
+def _ablated_run(runs: Sequence[Figures]) -> str:
+    """Median errors of a cell's trajectory and map."""
+    ate, surface = ([f[key] for f in runs if f[key] is not None] for key in ("ate_sim3_m", "map_median_m"))
+    return f"{median(ate):.4f}" + (f"; {100 * median(surface):.1f}" if surface else "")
+
+
 def _best(name: str, peers: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """The other monocular system with the lowest median error on the same recording that was measured on a CPU."""
     own = [p for p in peers if p["sequence"] == name.partition("/")[0] and p["source"].startswith("measured")]
@@ -208,17 +252,18 @@ def _median(f: Figures, key: str, text: str = "{:.4f}", factor: float = 1.0) -> 
     return text.format(factor * f[key][0]) if key in f else "–"
 
 
-def _spread(f: Figures, key: str, text: str = "{:.4f}", factor: float = 1.0) -> str:
+def _spread(f: Figures, key: str, text: str = "{:.4f}", factor: float = 1.0, to: str = "–", unit: str = "") -> str:
     """Median, and the range behind it when the runs differ."""
     if key not in f:
         return "–"
     middle, low, high = (text.format(factor * v) for v in f[key])
-    return middle if low == high else f"{middle} ({low}–{high})"
+    return f"{middle}{unit}" + ("" if low == high else f" ({low}{to}{high})")
 
 
 def _off(f: Figures, key: str) -> str:
     """Error of the scale: the factor that lengths must be multiplied by, minus 1, as ``edgeslam eval`` prints it."""
-    return _spread({key: [100 * (v - 1) for v in f[key]]}, key, "{:+.1f} %") if key in f else "–"
+    errors = {key: [round(100 * (v - 1), 1) + 0.0 for v in f[key]]} if key in f else {}  # + 0.0: no minus before zero
+    return _spread(errors, key, "{:+.1f}", to=" to ", unit=" %")
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -242,7 +287,11 @@ def rewritten(text: str, made: dict[str, str]) -> str:
 
 def current() -> dict[str, str]:
     """Blocks of the latest release."""
-    return blocks(newest(), tomllib.loads(PEERS.read_text(encoding="utf-8"))["peer"])
+    return blocks(
+        newest(),
+        json.loads(ABLATION.read_text(encoding="utf-8")),
+        tomllib.loads(PEERS.read_text(encoding="utf-8"))["peer"],
+    )
 
 
 def main() -> None:

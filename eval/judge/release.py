@@ -26,6 +26,7 @@ RUNS: dict[str, int] = CASES["release"]
 
 COMMANDS = {
     "demo": "edgeslam demo --out runs/demo",
+    "calibrate": "edgeslam calibrate recordings/tello_calibration --board 8x6 --out tello.yaml",
     "run": "edgeslam run recordings/tum_fr1_xyz --out runs/fr1",
     "evaluate": "edgeslam eval runs/fr1 -g recordings/tum_fr1_xyz",
     "occupancy": "edgeslam export-map runs/demo --format occupancy --out grid",
@@ -126,9 +127,10 @@ def command_outputs(data: Path, out: Path, commit: str, say: Callable[[str], Non
         found = {"key": [commit, COMMANDS], "lines": {}}
     recordings = folder / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
-    for name, (recording, _) in find_recordings(data).items():
+    there = {folder.name: folder for folder in data.iterdir() if folder.is_dir()}
+    for name, folder_of_data in (there | {name: found for name, (found, _) in find_recordings(data).items()}).items():
         if not (recordings / name).exists():
-            (recordings / name).symlink_to(recording)
+            (recordings / name).symlink_to(folder_of_data.resolve())
     for name, command in COMMANDS.items():
         if name not in found["lines"]:
             say(f"$ {command}")
