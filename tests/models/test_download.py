@@ -13,7 +13,7 @@ import pytest
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.files import download as fetching
 from edgeslam_torch.files.download import KeepEncryption, remember, remembered
-from edgeslam_torch.models.download import REMOTES, cache_folder, download
+from edgeslam_torch.models.download import cache_folder, download
 
 CONTENT = bytes(range(256)) * 700
 
@@ -82,13 +82,6 @@ def test_wrong_checksum_leaves_nothing(server, tmp_path):
 
 
 # -- trust on first use --------------------------------------------------------------------------------------------
-
-
-def test_https_comes_before_http():
-    for remote in REMOTES.values():
-        schemes = [url.split(":")[0] for url in remote.urls]
-        assert schemes == sorted(schemes, reverse=True)
-        assert set(schemes) == {"https", "http"}
 
 
 def test_where_https_does_not_answer_http_is_taken_and_known_as_such(server, tmp_path):
