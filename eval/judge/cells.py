@@ -46,9 +46,11 @@ class Variant:
 
     def applied_to(self, recording: Recording, seed: int = 0) -> Recording:
         """The recording, changed; ``seed`` is the draw of a perturbation."""
+        first = self.first
         if self.perturb_px:
-            recording = sources.perturbed(recording, seed, self.perturb_px)
-        recording = sources.part(recording, self.first, self.rate)
+            first, recording = seed, sources.perturbed(recording, seed, self.perturb_px)
+        if (first, self.rate) != (0, 1):
+            recording = recording.part(first, self.rate)
         if self.shrink > 1:
             recording = sources.smaller(recording, self.shrink)
         return sources.with_focal_length(recording, self.focal)

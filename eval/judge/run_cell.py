@@ -45,7 +45,7 @@ def run_cell(case: dict[str, Any], folder: Path) -> dict[str, Any]:
     before_ms = orb_pass_ms()
     timing_s = time.process_time() - begin_cpu_s
     source, truth = opened(cell, folder, Path(case["flights"]))
-    source = sources.part(source, count=case["max_frames"])
+    source = replace(source, max_frames=case["max_frames"])
     earlier = AtlasFiles()
     if cell.variant == SECOND_FLIGHT:
         from edgeslam_torch.atlas.atlas_file import read_atlas
@@ -104,12 +104,12 @@ def opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tru
     place = Path(cell.folder)
     source = _recording(place)
     if cell.imu == RECORDED:
-        return sources.part(source, cell.seed), Truth(place)
+        return source.part(cell.seed, 1), Truth(place)
     source = replace(source, telemetry=[], imu=None, imu_readings=None)  # images alone
     if cell.variant in (KIDNAP, BACKWARDS):
         return _reordered(cell, source, folder / "groundtruth.txt")
     if cell.variant == SECOND_FLIGHT:
-        return sources.part(source, CASES[SECOND_FLIGHT][cell.base]), Truth(place)
+        return source.part(CASES[SECOND_FLIGHT][cell.base], 1), Truth(place)
     dataset = open_dataset(place)
     if cell.telemetry:
         drawn = Drawn(dataset.truth, dataset.frame_stamps_s, cell.seed)
@@ -134,7 +134,7 @@ def _first_flight(cell: Cell, flights_root: Path) -> tuple[Recording, Truth]:
         place = flights.flight_folder(flights_root, cell.course, cell.seed)
         return _recording(place), Truth(place)
     source = replace(_recording(Path(cell.folder)), telemetry=[], imu=None, imu_readings=None)
-    return sources.part(source, count=CASES[SECOND_FLIGHT][cell.base]), Truth(Path(cell.folder))
+    return replace(source, max_frames=CASES[SECOND_FLIGHT][cell.base]), Truth(Path(cell.folder))
 
 
 def _recording(place: Path) -> Recording:

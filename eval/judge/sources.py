@@ -1,6 +1,5 @@
-"""Variants of a recording as sources: another rate, size, start, focal length or order; no file is copied."""
+"""Variants of a recording as sources: another size, calibration or order; no file is copied."""
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, islice
@@ -42,34 +41,6 @@ def _resized(image: NDArray[np.uint8], size: Size | None) -> NDArray[np.uint8]:
     return image if size is None else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def part(recording: Recording, first: int = 0, step: int = 1, count: int | None = None) -> Recording:
-    """No more than ``count`` of every ``step``-th frame from number ``first`` on, numbered anew, with their stamps.
-
-    Telemetry and IMU readings of a later start begin one second before it.
-    """
-    if (first, step, count) == (0, 1, None):
-        return recording
-    length = recording.length
-    if length is not None:
-        length = -(-max(0, length - first) // step)
-        length = length if count is None else min(count, length)
-
-    def decode(problems: list[Problem]) -> Iterator[Frame]:
-        chosen = islice(islice(recording.decode(problems), first, None, step), count)
-        return (ChangedFrame(frame, i, frame.stamp_s) for i, frame in enumerate(chosen))
-
-    changed = replace(recording, decode=decode, length=count if length is None else length)
-    start = next(changed.decode([]), None) if first and (recording.telemetry or recording.imu_readings) else None
-    if start is None:
-        return changed
-    begin_s, felt = start.stamp_s - 1.0, recording.imu_readings
-    return replace(
-        changed,
-        telemetry=[s for s in recording.telemetry if s.stamp_s >= begin_s],
-        imu_readings=None if felt is None else felt.between(begin_s, math.inf),
-    )
-
-
 def smaller(recording: Recording, factor: int) -> Recording:
     """Images ``factor`` times smaller in width and height, and the camera with them."""
     size = (recording.camera.width // factor, recording.camera.height // factor)
@@ -87,15 +58,14 @@ def with_focal_length(recording: Recording, factor: float) -> Recording:
 
 
 def perturbed(recording: Recording, draw: int, sigma_px: float) -> Recording:
-    """The recording from its ``draw``-th frame on, with its calibration perturbed by ``sigma_px``.
+    """The recording with its calibration perturbed by ``sigma_px``.
 
     The perturbation is far below the accuracy of keypoints, so it measures the scatter of results by chance.
     """
     camera = recording.camera
     off = np.random.default_rng(draw).normal(0.0, sigma_px, 4)
     values = (np.array([camera.fx, camera.fy, camera.cx, camera.cy]) + off).tolist()
-    other = replace(camera, **dict(zip(("fx", "fy", "cx", "cy"), values, strict=True)))
-    return replace(part(recording, draw), camera=other)
+    return replace(recording, camera=replace(camera, **dict(zip(("fx", "fy", "cx", "cy"), values, strict=True))))
 
 
 def reordered(recording: Recording, images: Sequence[ImageEntry], order: IntArray, stamps_s: FloatArray) -> Recording:

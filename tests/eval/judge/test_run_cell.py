@@ -99,7 +99,7 @@ def test_a_recordings_own_imu_is_a_cell_of_its_own(recording, tmp_path):
     for imu, start in (("", 0), (RECORDED, 3)):
         source, _ = run_cell.opened(Cell("stairs", 3, str(with_imu), imu=imu), tmp_path, tmp_path)
         assert (source.imu_readings is not None) == bool(imu)
-        assert next(source.decode([])).stamp_s == pytest.approx(stamps_s[start], abs=1e-6)
+        assert next(source.frames()).stamp_s == pytest.approx(stamps_s[start], abs=1e-6)
 
 
 def test_simulated_flight_is_judged_by_its_world(tmp_path, monkeypatch):

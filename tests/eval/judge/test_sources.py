@@ -9,7 +9,6 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.layouts import read_sequence
 from edgeslam_torch.readers.source import open_source
-from edgeslam_torch.types import TelemetrySample
 
 CAMERA = Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
 
@@ -22,20 +21,6 @@ def numbered():
 
 def seen(recording):
     return [(f.index, round(f.stamp_s, 3), int(f.image[0, 0, 0])) for f in recording.frames()]
-
-
-def test_every_third_frame_keeps_its_stamp_and_is_numbered_anew(numbered):
-    third = sources.part(numbered, step=3)
-    assert seen(third) == [(k, round(0.3 * k, 3), 3 * k) for k in range(7)]
-    assert third.length == 7
-    assert seen(third) == seen(third), "frames can be asked for again"
-
-
-def test_start_at_leaves_the_first_frames_out(numbered):
-    later = sources.part(numbered, 17)
-    assert seen(later) == [(0, 1.7, 17), (1, 1.8, 18), (2, 1.9, 19)]
-    assert later.length == 3
-    assert seen(sources.part(numbered, 50)) == []
 
 
 def test_variant_starts_first_and_then_thins(numbered):
@@ -71,12 +56,6 @@ def test_half_size_of_jpeg_files_has_grey_and_colour_of_one_size(tmp_path, write
     assert [f.grey.shape for f in frames] == [(24, 32)] * 2
     assert [f.image.shape[:2] for f in frames] == [(24, 32)] * 2
     assert frames[0].path.name == "1.000000.jpg"
-
-
-def test_telemetry_from_long_before_the_start_is_left_out(numbered):
-    numbered.telemetry = [TelemetrySample(0.1 * k) for k in range(20)]
-    later = sources.part(numbered, 17)
-    assert [round(s.stamp_s, 1) for s in later.telemetry] == [round(0.1 * k, 1) for k in range(7, 20)]
 
 
 @pytest.mark.parametrize(
