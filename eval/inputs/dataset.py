@@ -39,18 +39,6 @@ class EvalDataset:
     """None without depth maps, or when the camera is not known."""
 
 
-@dataclass(frozen=True, slots=True)
-class MeasuredDepth:
-    """A recording's depth maps beside its colour images; no true poses are needed."""
-
-    maps: DepthMaps
-    frame_stamps_s: FloatArray
-    """``(F,)`` stamps of the colour images."""
-    image_paths: tuple[Path, ...]
-    camera: Camera
-    """Colour camera."""
-
-
 def open_dataset(folder: Path | str) -> EvalDataset:
     """Data set with ground truth in any layout; true poses alone will do.
 
@@ -68,11 +56,13 @@ def open_dataset(folder: Path | str) -> EvalDataset:
     stamps = sequence.groundtruth_stamps_s
     truth = read_trajectory(sequence.groundtruth, None if stamps is None else np.array(stamps))
     depth = _depth(sequence) if camera is not None else None
-    return EvalDataset(sequence.name, folder, truth, *_images(sequence), camera, depth)
+    frames = np.array([entry.stamp_s for entry in sequence.images])
+    paths = tuple(entry.path for entry in sequence.images)
+    return EvalDataset(sequence.name, folder, truth, frames, paths, camera, depth)
 
 
-def open_depth(folder: Path | str) -> MeasuredDepth:
-    """Measured depth of a recording.
+def open_depth(folder: Path | str) -> tuple[Sequence, DepthMaps, Camera]:
+    """A recording with its depth maps and its colour camera; no true poses are needed.
 
     Raises:
         EvaluationError: If the folder has no depth maps, or its camera is not known.
@@ -84,7 +74,7 @@ def open_depth(folder: Path | str) -> MeasuredDepth:
         raise EvaluationError(f"{folder}: no depth.txt and rgb.txt, nor *.depth.png, in this folder")
     if camera is None:
         raise EvaluationError(f"{folder}: the camera is not known; put a camera.yaml into the folder")
-    return MeasuredDepth(depth, *_images(sequence), camera)
+    return sequence, depth, camera
 
 
 def find_recordings(data: Path, min_frames: int = 30, min_hz: float = 0.0) -> dict[str, tuple[Path, FloatArray]]:
@@ -150,10 +140,6 @@ def _depth(sequence: Sequence) -> DepthMaps | None:
         return None if sequence.depth is None else sequence.depth()
     except (SourceError, CalibrationError) as error:
         raise EvaluationError(str(error)) from error
-
-
-def _images(sequence: Sequence) -> tuple[FloatArray, tuple[Path, ...]]:
-    return np.array([entry.stamp_s for entry in sequence.images]), tuple(entry.path for entry in sequence.images)
 
 
 def _poses_alone(folder: Path) -> Path:

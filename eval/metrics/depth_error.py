@@ -179,14 +179,14 @@ def compare_with_recording(prediction: Path, folder: Path) -> DepthReport:
     Raises:
         EvaluationError: If the recording has no depth maps, or none belongs to a prediction.
     """
-    measured, maps, reports = open_depth(folder), _named(prediction, _MAPS), []
-    for stamp, path in zip(measured.frame_stamps_s, measured.image_paths, strict=True):
-        index = int(nearest(measured.maps.stamps_s, np.array([stamp]))[0])
-        if path.stem not in maps or abs(measured.maps.stamps_s[index] - stamp) > DEFAULT_MAX_DT_S:
+    (sequence, measured, camera), maps, reports = open_depth(folder), _named(prediction, _MAPS), []
+    for entry in sequence.images:
+        index = int(nearest(measured.stamps_s, np.array([entry.stamp_s]))[0])
+        if entry.path.stem not in maps or abs(measured.stamps_s[index] - entry.stamp_s) > DEFAULT_MAX_DT_S:
             continue
-        truth = measured.maps.read_registered(index, measured.camera)
-        image = np.asarray(measured.camera.undistort_image(_grey(path)), np.uint8)
-        reports.append(report_depth(read_depth(maps[path.stem], 1e-3), truth, image))
+        truth = measured.read_registered(index, camera)
+        image = np.asarray(camera.undistort_image(_grey(entry.path)), np.uint8)
+        reports.append(report_depth(read_depth(maps[entry.path.stem], 1e-3), truth, image))
     if not reports:
         raise EvaluationError(
             f"{prediction}: no depth map is named after an image of {folder} that has measured depth within "
