@@ -6,7 +6,7 @@ import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.dressing import fits, furnish_wall, lamps_anywhere, rug
-from edgeslam_torch.synthetic.house.furniture import PIECES, cartons, chair, clutter, table
+from edgeslam_torch.synthetic.house.pieces import build, furniture, stand
 from edgeslam_torch.synthetic.house.render import Rendered, render
 from edgeslam_torch.synthetic.house.scene import Place, Scene, random_paint
 from edgeslam_torch.synthetic.house.walls import SIDES, shell, side_of
@@ -37,7 +37,7 @@ def random_room(rng: Rng, *, texel_m: float = 0.006) -> World:
     density, pictures = float(rng.uniform(0.3, 1.0)), float(rng.uniform(0.0, 0.8))
     for side in SIDES:
         place, length = side_of(low, high, side)
-        furnish_wall(scene, place, length, rng, size[2], density=density, door=rng.random() < 0.35, pictures=pictures)
+        furnish_wall(scene, place, length, rng, density=density, door=rng.random() < 0.35, pictures=pictures)
     for _ in range(int(rng.poisson(size[0] * size[1] / 14.0))):
         _in_the_middle(scene, rng)
     if rng.random() < 0.4:
@@ -59,20 +59,21 @@ def _in_the_middle(scene: Scene, rng: Rng) -> None:
         width, depth = float(rng.uniform(0.7, 1.6)), float(rng.uniform(0.6, 1.0))
         if not fits(scene, place.at(0, -0.5), width, depth + 1.0):
             return
-        table(scene, place, rng, width, depth)
+        build(scene, place, rng, "table", width=width, depth=depth)
         for _ in range(int(rng.integers(1, 4))):
             side = -1 if rng.random() < 0.5 else 1
             y_chair = depth / 2 + side * (depth / 2 + rng.uniform(0.05, 0.3))
             yaw = (np.pi if side > 0 else 0.0) + rng.uniform(-0.5, 0.5)
-            chair(scene, place.at(rng.uniform(-0.3, 0.3) * width, y_chair, 0.0, yaw), rng)
+            build(scene, place.at(rng.uniform(-0.3, 0.3) * width, y_chair, 0.0, yaw), rng, "chair")
     elif kind < 0.7:
         if fits(scene, place.at(0, -0.4), 0.7, 0.8):
-            cartons(scene, place, rng)
+            build(scene, place, rng, "cartons")
     else:
-        piece = PIECES[str(rng.choice(list(PIECES)))]
+        name = str(rng.choice(list(furniture())))
+        piece = furniture()[name]
         width, depth = float(rng.uniform(*piece.width_m)), float(rng.uniform(*piece.depth_m))
         if fits(scene, place, width, depth):
-            piece.build(scene, place, rng, width, depth)
+            stand(scene, place, rng, name, width, depth)
 
 
 def _floating_clutter(scene: Scene, rng: Rng) -> None:
@@ -89,7 +90,7 @@ def _floating_clutter(scene: Scene, rng: Rng) -> None:
             u, v = (a / np.linalg.norm(a) * s for a, s in zip(axes, size[:2], strict=True))
             scene.surface(p, u, v, paint, "sheet", two_sided=True)
     width, depth = (scene.high_w - scene.low_w)[:2].tolist()
-    clutter(scene, Place(0.0, -0.5 * depth, 0.0), rng, width, depth, 6)
+    build(scene, Place(0.0, -0.5 * depth, 0.0), rng, "clutter", width=width, depth=depth, count=6)
 
 
 def look(p_w: FloatArray, yaw_rad: float, down_rad: float = 0.0, roll_rad: float = 0.0) -> FloatArray:

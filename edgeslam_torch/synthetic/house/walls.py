@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.synthetic.house.furniture import picture_paint
+from edgeslam_torch.synthetic.house.pieces import picture_paint
 from edgeslam_torch.synthetic.house.scene import Paint, Place, Scene, random_paint
 from edgeslam_torch.types import FloatArray
 

@@ -9,13 +9,15 @@ import numpy as np
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.synthetic.house import dressing
+from edgeslam_torch.synthetic.house.pieces import build
 from edgeslam_torch.synthetic.house.scene import Place, Scene, random_paint
+from edgeslam_torch.synthetic.house.values import Values
 from edgeslam_torch.synthetic.house.walls import SIDES, Opening, block, shell, side_of, wall
 from edgeslam_torch.synthetic.house.world import Box, World
 from edgeslam_torch.synthetic.sites.mirror import mirrored
 from edgeslam_torch.synthetic.sites.obstacles import connected, stand_in_the_way
 from edgeslam_torch.synthetic.sites.people import Walker, walker
-from edgeslam_torch.synthetic.sites.scene_file import Dress, SceneFile, Values, read_scene, scene_path
+from edgeslam_torch.synthetic.sites.scene_file import Dress, SceneFile, read_scene, scene_path
 from edgeslam_torch.synthetic.sites.site import Site, TrueExit
 from edgeslam_torch.synthetic.sites.solids import Solids
 from edgeslam_torch.types import FloatArray
@@ -117,7 +119,8 @@ def _flyable(file: SceneFile, rng: Rng) -> _Layout:
 
 
 def _laid_out(file: SceneFile, rng: Rng, given: dict[str, float]) -> _Layout:
-    value = Values(rng, file, given)
+    value = Values(rng, given)
+    value.define({name: number for name, number in file.values.items() if name not in given})
     rooms = _rooms(file, value)
     low, high = np.min([r[0] for r in rooms.values()], axis=0), np.max([r[1] for r in rooms.values()], axis=0)
     bounds = np.append(low, 0.0), np.append(high, value(file.height))
@@ -200,7 +203,7 @@ def _light(file: SceneFile, scene: Scene, rng: Rng, value: Values, rooms: dict[s
     lamps = [(x, y, lamp.width) for lamp in file.lamps for x in _list(value(lamp.x)) for y in _list(value(lamp.y))]
     for x, y, width in lamps or [(*corners.mean(0), 1.0) for corners in rooms.values()]:
         scene.lamps_w.append(np.array([x, y, scene.high_w[2] - 0.1]))
-        dressing.hang_lamp(scene, scene.lamps_w[-1], value(width), 0.3)
+        dressing.hang_lamp(scene, rng, scene.lamps_w[-1], value(width), 0.3)
 
 
 def _between(rooms: dict[str, FloatArray], solid: Sequence[FloatArray]) -> list[FloatArray]:
@@ -272,7 +275,7 @@ def _dress(
 ) -> None:
     """Dress the walls of a room, where they have no door and are not open."""
     scene = layout.scene
-    margin, height = value(dress.margin), float(scene.high_w[2])
+    margin = value(dress.margin)
 
     def feet(side: str) -> list[tuple[Place, float]]:
         """Place and length of the parts of a wall, the longest first."""
@@ -295,19 +298,19 @@ def _dress(
     if dress.style == "doors":
         for _ in range(int(rng.integers(2, 4))):
             for place, length in feet(dress.walls[int(rng.choice(len(dress.walls)))])[:1]:
-                dressing.blind_door(scene, place.at(rng.uniform(-0.5, 0.5) * (length - 2.0), 0.0), rng)
+                build(scene, place.at(rng.uniform(-0.5, 0.5) * (length - 2.0), 0.0), rng, "door")
         return
     order = rng.permutation(len(dress.walls)).tolist() if dress.shuffle else range(len(dress.walls))
     for side in (dress.walls[k] for k in order):
         for n, (place, length) in enumerate(feet(side)):
             if dress.style == "door":
                 if n == 0:
-                    dressing.blind_door(scene, place, rng)
+                    build(scene, place, rng, "door")
             elif dress.style == "corridor":
-                dressing.line_wall(scene, place, length, rng, height)
+                dressing.line_wall(scene, place, length, rng)
             else:
                 dressing.furnish_wall(
-                    scene, place, length, rng, height, density=value(dress.density),
+                    scene, place, length, rng, density=value(dress.density),
                     door=side == dress.door and n == 0, pictures=value(dress.pictures), names=dress.pieces or pieces,
                 )  # fmt: skip
 

@@ -5,11 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-from edgeslam_torch.synthetic.house.furniture import bin_, cartons, chair, floor_lamp, table
-from edgeslam_torch.synthetic.house.scene import Place, Scene, random_paint
+from edgeslam_torch.synthetic.house.pieces import build
+from edgeslam_torch.synthetic.house.scene import Place, Scene
 from edgeslam_torch.synthetic.house.world import Box
 
 Rng = np.random.Generator
+KINDS = ("column", "hanging_lamp", "table_and_chair", "pile", "lamp")
 _GRID_M = 0.1
 PASSAGE_M = 0.4
 """Kept free around at least one way from place to place: a drone of 20 cm with its uncertainty."""
@@ -24,45 +25,18 @@ def stand_in_the_way(
     kept: list[tuple[float, float]],
 ) -> None:
     """Add obstacles within a rectangle of the floor; those that would part the ``kept`` places are left out."""
-    kinds = (_column, _hanging, _table, _pile, _lamp)
     added = 0
     for _ in range(6 * count):
         if added == count:
             return
         x, y = (float(v) for v in rng.uniform(low, high))
         before = len(scene.surfaces), len(scene.boxes)
-        kinds[int(rng.integers(len(kinds)))](scene, Place(x, y, float(rng.uniform(-np.pi, np.pi))), rng)
+        kind = KINDS[int(rng.integers(len(KINDS)))]
+        build(scene, Place(x, y, float(rng.uniform(-np.pi, np.pi))), rng, kind)
         if connected(scene, kept):
             added += 1
         else:
             del scene.surfaces[before[0] :], scene.boxes[before[1] :]
-
-
-def _column(scene: Scene, place: Place, rng: Rng) -> None:
-    scene.prism(place, float(rng.uniform(0.12, 0.2)), float(scene.high_w[2]), random_paint(rng, ("concrete", "bricks",
-                "veneer", "tiles")), "column")  # fmt: skip
-
-
-def _hanging(scene: Scene, place: Place, rng: Rng) -> None:
-    """A lamp on a rod, at the height of flight."""
-    bottom, height = float(rng.uniform(0.9, 1.4)), float(scene.high_w[2])
-    scene.prism(place.at(0, 0, bottom), 0.2, 0.25, random_paint(rng, ("fabric", "metal"), vivid=0.3), "hanging lamp")
-    rod = height - bottom - 0.25
-    scene.box(place, (0, 0, height - rod / 2), (0.03, 0.03, rod), random_paint(rng, ("metal",)), "rod", faces="frbl")
-
-
-def _table(scene: Scene, place: Place, rng: Rng) -> None:
-    table(scene, place, rng, float(rng.uniform(0.7, 1.2)), float(rng.uniform(0.6, 0.8)))
-    chair(scene, place.at(0.0, -0.35, 0.0, 0.0), rng)
-
-
-def _pile(scene: Scene, place: Place, rng: Rng) -> None:
-    cartons(scene, place, rng)
-    bin_(scene, place.at(0.5, 0.0), rng)
-
-
-def _lamp(scene: Scene, place: Place, rng: Rng) -> None:
-    floor_lamp(scene, place, rng)
 
 
 def connected(scene: Scene, places: Sequence[Sequence[float]], unseen: Sequence[Box] = ()) -> bool:

@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgeslam_torch.synthetic.house.scene import Place, Scene, random_paint
+from edgeslam_torch.synthetic.house.pieces import build
+from edgeslam_torch.synthetic.house.scene import Place, Scene
 from edgeslam_torch.synthetic.house.world import Box, Quad
 from edgeslam_torch.types import FloatArray
 
 Rng = np.random.Generator
-_CLOTHES = ("fabric",)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,14 +67,8 @@ def walker(rng: Rng, ends_w: FloatArray, speed_m_s: float) -> Walker:
     length = float(np.linalg.norm(ends_w[1] - ends_w[0]))
     if length < 0.1 or speed_m_s <= 0:
         raise ValueError(f"a walker needs two places and a speed, got {ends_w.tolist()} at {speed_m_s} m/s")
-    tall = float(rng.uniform(1.6, 1.9))
     scene = Scene(np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 3.0]), lamps_w=[np.array([0.5, 0.8, 2.9])])
-    here = Place(0.0, 0.0, 0.0)
-    trousers, shirt, skin = (random_paint(rng, _CLOTHES, vivid=0.4) for _ in range(3))
-    for side in (-0.11, 0.11):
-        scene.box(here, (0.0, side, 0.24 * tall), (0.2, 0.18, 0.48 * tall), trousers, "person")
-    scene.box(here, (0.0, 0.0, 0.66 * tall), (0.24, 0.5, 0.36 * tall), shirt, "person", faces="frbltu")
-    scene.box(here, (0.0, 0.0, 0.92 * tall), (0.2, 0.17, 0.16 * tall), skin, "person")
+    build(scene, Place(0.0, 0.0, 0.0), rng, "person")
     world = scene.world("person")
     return Walker(
         world.quads, world.boxes, np.asarray(ends_w), speed_m_s, float(rng.uniform(0, 2 * length / speed_m_s))

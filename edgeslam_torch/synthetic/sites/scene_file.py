@@ -4,25 +4,22 @@ Where a number is expected, text may stand: arithmetic over the file's values, w
 ``"wide / 2 + uniform(-0.2, 0.2)"``.
 """
 
-import ast
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-import numpy as np
-
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.config_file import laid_over
 from edgeslam_torch.files.record_files import read_mapping
-from edgeslam_torch.synthetic.house.furniture import PIECES
+from edgeslam_torch.synthetic.house.pieces import furniture
+from edgeslam_torch.synthetic.house.values import Number
 from edgeslam_torch.synthetic.house.walls import DOOR_HEIGHT_M
 from edgeslam_torch.synthetic.textures.materials import MATERIALS
 
 FOLDER = Path(__file__).parent.parent / "scenes"
 T = TypeVar("T")
-Number = float | str
 Extent = tuple[Number, Number]
 Side = Literal["south", "east", "north", "west"]
 
@@ -140,8 +137,8 @@ class SceneFile:
     """Share of the light that comes from everywhere."""
     walls: tuple[str, ...] = ("rough_plaster", "wallpaper", "bricks", "concrete", "plaster")
     """Materials to choose from."""
-    pieces: tuple[str, ...] = tuple(PIECES)
-    """Furniture to choose from; what stands twice is twice as frequent."""
+    pieces: tuple[str, ...] = ()
+    """Furniture to choose from; what stands twice is twice as frequent; all of it when empty."""
     one_paint: bool = False
     """Whether all outer walls have the same paint."""
     random_lamps: bool = False
@@ -185,10 +182,10 @@ def read_scene(path: Path) -> SceneFile:
         parts[name] = tuple(_record(kind, entry, f"{path}: [[{name}]] {k}") for k, entry in enumerate(entries, 1))
     scene = dataclasses.replace(_record(SceneFile, table, str(path)), name=path.stem, **parts)
     named: list[tuple[str, tuple[str, ...], Iterable[str]]] = [("walls", scene.walls, MATERIALS)]
-    named += [("pieces", scene.pieces, PIECES)]
-    named += [(f"[[dress]] {k} pieces", d.pieces, PIECES) for k, d in enumerate(scene.dress, 1) if d.pieces]
+    named += [("pieces", scene.pieces, furniture())]
+    named += [(f"[[dress]] {k} pieces", d.pieces, furniture()) for k, d in enumerate(scene.dress, 1)]
     for where, given, known in named:
-        if not given or set(given) - set(known):
+        if set(given) - set(known) or not (given or known is not MATERIALS):
             raise ConfigError(f"{path}: {where} must be some of {', '.join(known)}, got {', '.join(given)}")
     return scene
 
@@ -232,57 +229,3 @@ def _record(kind: type[T], table: dict[str, Any], where: str) -> T:
         if getattr(part, name) is None:
             raise ConfigError(f"{where}: {name} is missing")
     return dataclasses.replace(part, values=values) if values else part  # type: ignore[type-var]
-
-
-_MAX_STEPS = 1000
-_SYNTAX = (
-    ast.Expression, ast.BinOp, ast.Add, ast.Sub, ast.Mult, ast.Div, ast.UnaryOp, ast.USub, ast.Compare, ast.cmpop,
-    ast.IfExp, ast.Call, ast.Name, ast.Load, ast.Constant,
-)  # fmt: skip
-
-
-def _steps(first: float, end: float, step: float) -> list[float]:
-    if not (step and 0 <= (end - first) / step <= _MAX_STEPS):
-        raise ValueError(f"steps must be from 0 to {_MAX_STEPS}")
-    return list(np.arange(first, end, step).tolist())
-
-
-class Values:
-    """The numbers of a scene for one seed."""
-
-    def __init__(self, rng: np.random.Generator, scene: SceneFile, given: Mapping[str, float]) -> None:
-        """Args: ``given`` takes the place of the file's own values."""
-        self._functions: dict[str, Callable[..., Any]] = {
-            "uniform": lambda low, high: float(rng.uniform(low, high)),
-            "either": lambda *options: options[int(rng.random() * len(options))],
-            "sample": lambda count, *options: set(rng.choice(options, count, replace=False).tolist()),
-            "steps": _steps,
-        }
-        self._known: dict[str, Any] = {}
-        for name, value in scene.values.items():
-            self._known[name] = given[name] if name in given else self(value)
-
-    def define(self, values: Mapping[str, Number]) -> None:
-        """Draw the values of a part."""
-        for name, value in values.items():
-            self._known[name] = self(value)
-
-    def __call__(self, value: Any) -> Any:
-        """A number, or a list of those that ``steps`` or TOML gave."""
-        if isinstance(value, tuple):
-            return [self(item) for item in value]
-        if not isinstance(value, str):
-            return value
-        try:
-            tree = ast.parse(value, mode="eval")
-            nodes = list(ast.walk(tree))
-            texts = [node for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str | bytes)]
-            if texts or any(not isinstance(node, _SYNTAX) for node in nodes):
-                raise ConfigError(f"{value!r} is not arithmetic")
-            names = self._functions | self._known
-            return eval(compile(tree, "scene", "eval"), {"__builtins__": {}}, names)
-        except NameError as error:
-            known = ", ".join([*self._known, *self._functions])
-            raise ConfigError(f"{value!r}: {error.name} is no value; known: {known}") from error
-        except (SyntaxError, TypeError, ValueError, ArithmeticError, RecursionError, MemoryError) as error:
-            raise ConfigError(f"{value!r} cannot be computed ({error})") from error

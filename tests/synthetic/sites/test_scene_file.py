@@ -1,11 +1,10 @@
-"""Scene files: what is wrong is said in one line with the key's name; arithmetic and draws."""
+"""Scene files: what is wrong is said in one line with the key's name."""
 
-import numpy as np
 import pytest
 
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.synthetic.sites.build import SITES, named_site
-from edgeslam_torch.synthetic.sites.scene_file import FOLDER, SceneFile, Values, read_scene, scene_path
+from edgeslam_torch.synthetic.sites.scene_file import FOLDER, read_scene, scene_path
 
 FLAT = """
 start = [0.8, 2, 0]
@@ -74,17 +73,6 @@ def test_what_is_wrong_is_named(scene, tmp_path, old, new, words):
 def test_unknown_names_and_negative_seeds_are_refused(name, seed):
     with pytest.raises(ConfigError):
         named_site(name, seed)
-
-
-def test_values_are_drawn_in_order_and_may_be_given():
-    file = SceneFile(values={"wide": "uniform(2, 3)", "half": "wide / 2", "side": "either(-1, 1)"})
-    rng = np.random.default_rng(4)
-    wide, coin = rng.uniform(2, 3), rng.random()
-    value = Values(np.random.default_rng(4), file, {})
-    assert value("half * side") == pytest.approx(wide / 2 * (-1 if coin < 0.5 else 1))
-    assert Values(rng, file, {"wide": 8.0})(("half", 3, "steps(0, half, 1.5)")) == [4.0, 3, [0.0, 1.5, 3.0]]
-    drawn = Values(rng, SceneFile(values={"two": "sample(2, 5, 6, 7)"}), {})
-    assert sum(drawn(f"1 if {k} in two else 0") for k in (5, 6, 7)) == 2
 
 
 def test_a_scene_extends_another(scene):

@@ -1,0 +1,155 @@
+"""The builder of `furniture.toml`: what stands, hangs and lies in a scene, each piece at a `Place` of its own axes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.files.record_files import read_mapping
+from edgeslam_torch.synthetic.house.scene import PICTURES, VARIANTS, Paint, Place, Scene, random_paint
+from edgeslam_torch.synthetic.house.values import Values
+from edgeslam_torch.synthetic.textures.materials import MATERIALS
+
+Rng = np.random.Generator
+FILE = Path(__file__).parent.parent / "furniture.toml"
+
+
+@dataclass(frozen=True, slots=True)
+class Furniture:
+    """How much floor a piece takes that stands along walls [m]."""
+
+    width_m: tuple[float, float]
+    depth_m: tuple[float, float]
+    front_m: float
+    """Floor kept free before it."""
+    centred: bool
+    """Whether its origin is in its middle; else it is in the middle of its back."""
+
+
+@cache
+def _tables() -> dict[str, Any]:
+    return read_mapping(FILE, "TOML", ConfigError)
+
+
+@cache
+def furniture() -> dict[str, Furniture]:
+    """The pieces that stand along walls, by name."""
+    return {
+        name: Furniture(tuple(t["width"]), tuple(t["depth"]), t.get("front", 0.0), t.get("centred", False))
+        for name, t in _tables().items()
+        if "width" in t
+    }
+
+
+def stand(scene: Scene, place: Place, rng: Rng, name: str, width: float, depth: float) -> None:
+    """Add a piece of furniture with its back at ``place``."""
+    at = place.at(0, depth / 2) if furniture()[name].centred else place
+    build(scene, at, rng, name, width=width, depth=depth)
+
+
+def build(scene: Scene, place: Place, rng: Rng, name: str, **given: Any) -> dict[str, Any]:
+    """Add a piece.
+
+    Args:
+        scene: What it is added to.
+        place: Its axes: x along the wall, y into the room.
+        rng: Of its values.
+        name: Of a table in `furniture.toml`.
+        given: Values that take the place of the table's own.
+
+    Returns:
+        Its values by name, such as the width that was drawn.
+    """
+    table = _tables()[name]
+    values = Values(rng, {**_names(), "ceiling": float(scene.high_w[2]), **given}, _paints(rng))
+    values.define({key: value for key, value in table.get("values", {}).items() if key not in given})
+    for step in table["steps"]:
+        _take(scene, place, rng, values, step)
+    return values.known
+
+
+def _take(scene: Scene, place: Place, rng: Rng, values: Values, step: dict[str, Any]) -> None:
+    """One step of a piece, as often as it says."""
+    if not values(step.get("when", 1)):
+        return
+    each = step.get("each", {})
+    rounds = [dict(zip(each, chosen, strict=True)) for chosen in product(*(values(v) for v in each.values()))]
+    for k in range(values(step.get("repeat", 1))):
+        for chosen in rounds:
+            values.known |= {**chosen, "k": k} if "repeat" in step else chosen
+            values.define(step.get("let", {}))
+            if values(step.get("until", 0)):
+                return
+            here = place.at(*values(step["place"])) if "place" in step else place
+            if "piece" in step:
+                build(scene, here, rng, step["piece"], **{n: values(v) for n, v in step.get("with", {}).items()})
+            elif "steps" in step:
+                for inner in step["steps"]:
+                    _take(scene, here, rng, values, inner)
+            elif "shape" in step:
+                _shape(scene, here, values, step)
+
+
+def _shape(scene: Scene, place: Place, values: Values, step: dict[str, Any]) -> None:
+    """A painted shape, its values drawn in the order of its keys' description in the file."""
+    shape, name = step["shape"], step["name"]
+    at, size = values(step.get("at", (0, 0, 0))), values(step.get("size", ()))
+    paint = values(step["paint"])
+    if shape == "box":
+        special = {face: found for face, text in step.get("paints", {}).items() if (found := values(text)) is not None}
+        faces, inside = step.get("faces", "frblt"), step.get("inside", False)
+        scene.box(place, at, size, paint, name, faces=faces, special=special, inside=inside)
+    elif shape == "panel":
+        scene.panel(place, at, *size, paint, name)
+    elif shape == "prism":
+        scene.prism(place, *size, paint, name, sides=step.get("sides", 8))
+    else:
+        u, v = (place.direction(values(step[key])) for key in "uv")
+        scene.surface(place.point(at), u, v, paint, name, two_sided=step.get("two_sided", False))
+
+
+WOODS = ("veneer", "veneer", "wood", "metal", "plaster")
+CLOTHS = ("fabric", "fabric", "carpet", "rough_plaster")
+
+
+@cache
+def _names() -> dict[str, Any]:
+    """Materials, pictures and groups of materials, as text calls them."""
+    return {**{name: name for name in (*MATERIALS, *PICTURES)}, "woods": WOODS, "cloths": CLOTHS, "nothing": None}
+
+
+def _paints(rng: Rng) -> dict[str, Callable[..., Any]]:
+    """What text may call to paint something."""
+
+    def paint(*kinds: str | tuple[str, ...], vivid: float = 0.04) -> Paint:
+        return random_paint(
+            rng, tuple(k for kind in kinds for k in ([kind] if isinstance(kind, str) else kind)), vivid=vivid
+        )
+
+    def variant() -> int:
+        return int(rng.integers(VARIANTS))
+
+    def glowing(paint: Paint, gain: float = 1.0) -> Paint:
+        blue, green, red = (float(gain * t) for t in paint.tint)
+        return replace(paint, tint=(blue, green, red), glow=True)
+
+    return {
+        "paint": paint,
+        "variant": variant,
+        "image": lambda kind: picture_paint(rng, kind),
+        "plain": lambda kind, number=0, blue=1.0, green=1.0, red=1.0: Paint(kind, number, (blue, green, red)),
+        "dyed": lambda paint, blue, green, red: Paint(paint.kind, paint.variant, (blue, green, red)),
+        "tinted": lambda kind, number, like: Paint(kind, number, like.tint),
+        "glowing": glowing,
+    }
+
+
+def picture_paint(rng: Rng, kind: str) -> Paint:
+    """One of the pictures of a kind, slightly tinted."""
+    gain = np.exp(rng.normal(0.0, 0.06, 3))
+    return Paint(kind, int(rng.integers(VARIANTS)), (float(gain[0]), float(gain[1]), float(gain[2])))
