@@ -246,8 +246,9 @@ class _Part:
     """Images that one forward pass sees, for one of the signals."""
 
     signal: int
-    slots: list[Slot]
     batch: dict[str, Tensor]
+    names: list[str]
+    """What each image shows, for messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,7 +267,7 @@ class _Parts:
         for k in range(parts):
             for number, signal in enumerate(self.signals):
                 slots = [Slot(self.config.seed + 7919 * number, step, i) for i in mine[k::parts]]
-                found.append(_Part(number, slots, signal.draw(slots)))
+                found.append(_Part(number, *signal.draw(slots)))
         return found
 
 
@@ -324,11 +325,11 @@ def _losses(
     with state.arithmetic.autocast():
         predicted = state.network.predict(batch["image"])
         losses = signal.losses(predicted, batch)
-    losses = _hooked(hooks, state, Drawn(signal.name, batch, predicted, losses), len(part.slots))
+    losses = _hooked(hooks, state, Drawn(signal.name, batch, predicted, losses), len(part.names))
     named = {}
     for name, value in losses.items():
         if not torch.isfinite(value).all():
-            images = [d for d, v in zip(signal.describe(part.slots), value, strict=True) if not torch.isfinite(v)]
+            images = [d for d, v in zip(part.names, value, strict=True) if not torch.isfinite(v)]
             bad.append(f"loss {signal.name}/{name} is not finite for {', '.join(images)}")
         named[f"{signal.name}/{name}"] = value.float().sum() / config.batch
     return named

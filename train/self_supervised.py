@@ -78,21 +78,13 @@ class SelfSupervised:
         angle = AngleLoss(kernel=Kernel.HUBER, delta=0.2)
         self._lshape = LShapeLoss(angle, CollinearityLoss(kernel=Kernel.HUBER, delta=0.05))
 
-    def describe(self, slots: Sequence[Slot]) -> list[str]:
-        """``sequence/image`` of each slot."""
-        names = []
-        for slot in slots:
-            s, i = self._items[int(slot.rng().integers(len(self._items)))]
-            names.append(f"{self.sequences[s].name}/{self.sequences[s].views[i].name}")
-        return names
-
-    def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
+    def draw(self, slots: Sequence[Slot]) -> tuple[dict[str, Tensor], list[str]]:
         """Normalised inputs of view i and of its first partner (``image``, stacked), and the targets of the
-        losses."""
-        samples = [self._sample(slot) for slot in slots]
+        losses; ``sequence/image`` of each slot."""
+        samples, names = zip(*(self._sample(slot) for slot in slots), strict=True)
         batch = {key: torch.stack([s[key] for s in samples]) for key in samples[0]}
         batch["image"] = torch.cat((batch.pop("input_i"), batch.pop("input_j")))
-        return batch
+        return batch, list(names)
 
     def losses(self, predicted: Prediction, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Weighted terms, each ``(B,)``."""
@@ -134,7 +126,7 @@ class SelfSupervised:
         on_arms = back_project(arms.flatten(1, 2), _depth_at(log_i, arms).flatten(1), K).reshape(*shape, 3)
         return self._lshape(T, corners, depth, cos_j, K, on_arms, (arms[..., 0] >= 0).reshape(shape))
 
-    def _sample(self, slot: Slot) -> dict[str, Tensor]:
+    def _sample(self, slot: Slot) -> tuple[dict[str, Tensor], str]:
         rng = slot.rng()
         s, i = self._items[int(rng.integers(len(self._items)))]
         sequence, scale = self.sequences[s], float(np.exp(self._scale[s]))
@@ -175,18 +167,7 @@ class SelfSupervised:
             "arms": torch.from_numpy(arms),
             "junctions_i": torch.from_numpy(junction_points(images[0], JUNCTIONS)),
             "junctions_j": torch.from_numpy(junction_points(images[1], JUNCTIONS)),
-        }
-
-
-def fit_log_scale(views: Sequence[PosedView], log_depths: Sequence[FloatArray]) -> float:
-    """Log of metres per map unit that makes the network's depth and the map points agree (median).
-
-    Args:
-        views: Of one run.
-        log_depths: The network's log depth [log m] at each view's points, ``(N_i,)``.
-    """
-    ratios = [d - np.log(v.z) for v, d in zip(views, log_depths, strict=True)]
-    return float(np.median(np.concatenate(ratios)))
+        }, f"{sequence.name}/{view.name}"
 
 
 def _zoomed(view: PosedView, size: tuple[int, int], zoom: tuple[float, float], rng: np.random.Generator) -> FloatArray:

@@ -6,17 +6,9 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from edgeslam_torch.losses.depth_terms import (
-    BerHu,
-    GradientMatching,
-    LaplaceNll,
-    LogSlope,
-    MaskedL1,
-    SILog,
-    masked_mean,
-)
+from edgeslam_torch.losses.depth_terms import GradientMatching, LaplaceNll, LogSlope, MaskedL1, masked_mean
 from edgeslam_torch.losses.total import TotalLoss
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import Prediction
@@ -43,12 +35,8 @@ class Signal(Protocol):
 
     name: str
 
-    def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
-        """Tensors of a batch, one image per slot; ``names`` for messages is kept by `describe`."""
-        ...
-
-    def describe(self, slots: Sequence[Slot]) -> list[str]:
-        """What each slot shows, for messages."""
+    def draw(self, slots: Sequence[Slot]) -> tuple[dict[str, Tensor], list[str]]:
+        """Tensors of a batch, one image per slot, and what each shows, for messages."""
         ...
 
     def losses(self, predicted: Prediction, batch: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -61,40 +49,18 @@ class SupervisedWeights:
     """Weights of the supervised terms; 0 leaves one out."""
 
     l1: float = 1.0
-    berhu: float = 0.0
-    silog: float = 0.0
     gradient: float = 0.5
     slope: float = 0.0
     """Against far depth that is predicted too near."""
     uncertainty: float = 0.1
 
 
-class SupervisedTerms:
-    """Losses of a prediction against labels."""
+class Views(Protocol):
+    """Views in memory, or read when they are drawn."""
 
-    def __init__(self, weights: SupervisedWeights) -> None:
-        self._weights = asdict(weights)
-        self._terms = nn.ModuleDict(
-            {
-                "l1": MaskedL1(),
-                "berhu": BerHu(),
-                "silog": SILog(),
-                "gradient": GradientMatching(),
-                "slope": LogSlope(),
-            }
-        )
-        self._nll = LaplaceNll()
+    def __len__(self) -> int: ...
 
-    def __call__(self, predicted: Prediction, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Weighted terms, each ``(B,)``, of a batch as `Supervised.draw` gives it."""
-        target, mask, weights = batch["log_depth"], batch["mask"], self._weights
-        # Part of the mean error is removed from the residual, including its gradient, leaving scale partly free.
-        free = (1.0 - batch["metric"]) * masked_mean(predicted.log_depth - target, mask)
-        target = target + free.view(-1, 1, 1, 1)
-        terms = {n: term(predicted.log_depth, target, mask) for n, term in self._terms.items() if weights[n]}
-        if predicted.log_sigma is not None and weights["uncertainty"]:
-            terms["uncertainty"] = self._nll(predicted.log_sigma, predicted.log_depth, target, mask)
-        return TotalLoss(weights).weighted(terms)
+    def __getitem__(self, index: int, /) -> View: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +68,7 @@ class Source:
     """A pool of views drawn with equal chances."""
 
     name: str
-    views: Sequence[View]
+    views: Views
     share: float
     """Part of the batch taken from here, relative to the other sources."""
     metric: float = 1.0
@@ -122,35 +88,38 @@ class Supervised:
     def __post_init__(self) -> None:
         shares = np.array([s.share for s in self.sources], dtype=np.float64)
         self._edges = np.cumsum(shares / shares.sum())
-        self._terms = SupervisedTerms(self.weights)
+        self._terms = {"l1": MaskedL1(), "gradient": GradientMatching(), "slope": LogSlope()}
+        self._nll = LaplaceNll()
 
-    def _choose(self, rng: np.random.Generator) -> tuple[Source, int]:
-        source = self.sources[min(int(np.searchsorted(self._edges, rng.random())), len(self.sources) - 1)]
-        return source, int(rng.integers(len(source.views)))
-
-    def describe(self, slots: Sequence[Slot]) -> list[str]:
-        """``source/index`` of each image."""
-        chosen = [self._choose(slot.rng()) for slot in slots]
-        return [f"{source.name}/{index}" for source, index in chosen]
-
-    def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
+    def draw(self, slots: Sequence[Slot]) -> tuple[dict[str, Tensor], list[str]]:
         """``image (B, 3, H, W)``, ``log_depth (B, 1, H, W)`` at the training focal length, ``mask``,
-        ``metric (B,)``."""
-        images, targets, metric = [], [], []
+        ``metric (B,)``; ``source/index`` of each image."""
+        images, targets, metric, names = [], [], [], []
         size = (self.metadata.input_height, self.metadata.input_width)
         for slot in slots:
             rng = slot.rng()
-            source, index = self._choose(rng)
+            source = self.sources[min(int(np.searchsorted(self._edges, rng.random())), len(self.sources) - 1)]
+            index = int(rng.integers(len(source.views)))
             view = random_view(source.views[index], size, self.augment, rng)
             images.append(image_tensor(view.image, self.metadata))
             metric.append(source.metric)
             focal = float(np.sqrt(view.K[0, 0] * view.K[1, 1]))
             targets.append(torch.from_numpy(view.depth_m * (self.metadata.focal_px / focal))[None])
+            names.append(f"{source.name}/{index}")
         depth = torch.stack(targets)
         mask = (depth > NEAR_M) & (depth < FAR_M)
         log_depth = depth.clamp(NEAR_M, FAR_M).log()
-        return {"image": torch.stack(images), "log_depth": log_depth, "mask": mask, "metric": torch.tensor(metric)}
+        return {
+            "image": torch.stack(images), "log_depth": log_depth, "mask": mask, "metric": torch.tensor(metric)
+        }, names  # fmt: skip
 
     def losses(self, predicted: Prediction, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Weighted terms, each ``(B,)``."""
-        return self._terms(predicted, batch)
+        target, mask, weights = batch["log_depth"], batch["mask"], asdict(self.weights)
+        # Part of the mean error is removed from the residual, including its gradient, leaving scale partly free.
+        free = (1.0 - batch["metric"]) * masked_mean(predicted.log_depth - target, mask)
+        target = target + free.view(-1, 1, 1, 1)
+        terms = {n: term(predicted.log_depth, target, mask) for n, term in self._terms.items() if weights[n]}
+        if predicted.log_sigma is not None and weights["uncertainty"]:
+            terms["uncertainty"] = self._nll(predicted.log_sigma, predicted.log_depth, target, mask)
+        return TotalLoss(weights).weighted(terms)

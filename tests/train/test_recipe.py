@@ -239,7 +239,7 @@ class _PoisonedAt(Supervised):
 def test_not_finite_loss_stops_and_names_the_images(tmp_path, step, kept):
     poisoned = _PoisonedAt([Source("made", views(), 1.0)], METADATA)
     poisoned.step = step
-    named = poisoned.describe([Slot(0, step, 2)])[0]
+    named = signal().draw([Slot(0, step, 2)])[1][0]
     expected = f"step {step}: loss supervised/l1 is not finite for {named}; .*{kept}"
     with pytest.raises(NonFiniteLossError, match=expected):
         train(network(), METADATA, [poisoned], CONFIG, tmp_path)
@@ -510,7 +510,7 @@ def test_float16_leaves_out_steps_that_overflow(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_loss_that_is_not_finite_in_one_process_stops_all_with_its_name(tmp_path):
     ended = in_two_processes(POISONED, str(tmp_path / "out"))
-    named = Supervised([Source("made", views(), 1.0)], METADATA).describe([Slot(0, 3, 1)])[0]
+    named = signal().draw([Slot(0, 3, 1)])[1][0]
     for code, said in ended:
         assert code == 1
         assert f"step 3: loss supervised/l1 is not finite for {named}; " in said

@@ -16,9 +16,9 @@ from edgeslam_torch.models.checkpoint import build_network
 from edgeslam_torch.models.fastdepth import Prediction, Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.synthetic.house.render import render
-from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
+from edgeslam_torch.train.self_supervised import SelfSupervised
 from edgeslam_torch.train.signals import Slot
-from edgeslam_torch.train.teachers.teach import teach
+from edgeslam_torch.train.teachers.teach import log_metres, teach
 from edgeslam_torch.train.validate import metres_by
 from edgeslam_torch.train.views.junctions import junction_points, seen_cosines
 from edgeslam_torch.train.views.posed import is_run_folder, load_run, visible_points
@@ -101,7 +101,7 @@ def test_every_term_is_smallest_at_the_true_depth(sequence):
     signal = SelfSupervised([sequence], METADATA, zoom=(1.0, 1.0))
     slots = [Slot(0, 0, k) for k in range(2)]
     with never_flipped():
-        batch = signal.draw(slots)
+        batch, _ = signal.draw(slots)
         at = {f: signal.losses(_Oracle(signal, slots, f).predict(batch["image"]), batch) for f in (0.75, 1.0, 1.3)}
     for term in ("photometric", "points", "cycle"):
         wrong = min(at[0.75][term].mean(), at[1.3][term].mean())
@@ -113,7 +113,7 @@ def test_every_term_is_smallest_at_the_true_depth(sequence):
 def test_what_is_drawn_is_the_run_in_metres(sequence, k):
     """Brought to metres, baselines and depths are twice as long; points lie where the zoom puts them."""
     slot = Slot(3, 0, k)
-    batches = [SelfSupervised([sequence], METADATA, log_scale=[s]).draw([slot]) for s in (0.0, float(np.log(2.0)))]
+    batches = [SelfSupervised([sequence], METADATA, log_scale=[s]).draw([slot])[0] for s in (0.0, float(np.log(2.0)))]
     units, metres = ({name: value[0].double() for name, value in b.items() if name != "image"} for b in batches)
     known = units["known"].bool()
     torch.testing.assert_close(metres["T_j_i"][:, :3, 3], 2.0 * units["T_j_i"][:, :3, 3])
@@ -134,11 +134,11 @@ def test_what_is_drawn_is_the_run_in_metres(sequence, k):
 
 def test_batch_follows_the_slot_alone(sequence):
     signal = SelfSupervised([sequence], METADATA)
-    both = signal.draw([Slot(1, 7, 0), Slot(1, 7, 1)])
-    second = signal.draw([Slot(1, 7, 1)])
+    both, names = signal.draw([Slot(1, 7, 0), Slot(1, 7, 1)])
+    second, name = signal.draw([Slot(1, 7, 1)])
     assert torch.equal(both["rgb_i"][1:], second["rgb_i"])
     assert torch.equal(both["image"][1::2], second["image"])
-    assert signal.describe([Slot(1, 7, 1)])[0].startswith("run/0.")
+    assert names[1:] == name and name[0].startswith("run/0.")
 
 
 def test_flipped_pairs_keep_their_geometry(sequence):
@@ -148,7 +148,7 @@ def test_flipped_pairs_keep_their_geometry(sequence):
     signal = SelfSupervised([sequence], METADATA)
     errors = []
     for k in range(8):
-        b = signal.draw([Slot(3, k, 0)])
+        b, _ = signal.draw([Slot(3, k, 0)])
         known = b["known"][0]
         uv, z = b["uv"][0][known], b["log_z"][0][known].exp()
         uv_j, front = project(move(b["T_j_i"][0, 0], back_project(uv, z, b["K"][0])), b["K"][0])
@@ -168,7 +168,7 @@ def test_gradient_reaches_the_network(sequence):
     torch.manual_seed(0)
     network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
     signal = SelfSupervised([sequence], METADATA)
-    batch = signal.draw([Slot(0, 0, 0)])
+    batch, _ = signal.draw([Slot(0, 0, 0)])
     losses = signal.losses(network.predict(batch["image"]), batch)
     assert set(losses) == {"photometric", "points", "cycle", "lshape", "smooth", "uncertainty"}
     sum(v.sum() for v in losses.values()).backward()
@@ -178,9 +178,11 @@ def test_gradient_reaches_the_network(sequence):
 
 
 def test_scale_of_an_arbitrary_run_is_found(sequence):
-    views = [replace(v, z=v.z / 3.0) for v in sequence.views]
-    found = fit_log_scale(views, [np.log(v.z) for v in sequence.views])
-    assert np.exp(found) == pytest.approx(3.0, rel=1e-5)
+    depth = {v.name: render(world(), CAMERA, v.T_w_c).depth_m for v in sequence.views}
+    smaller = replace(sequence, views=[replace(v, z=v.z / 3.0) for v in sequence.views])
+    assert np.exp(log_metres(lambda view: depth[view.name], smaller)) == pytest.approx(3.0, rel=0.01)
+    with pytest.raises(SourceError, match="no depth"):
+        log_metres(lambda view: np.full(view.image.shape[:2], np.nan), smaller)
 
 
 def test_straight_pieces_lie_on_straight_edges(rng):

@@ -18,7 +18,7 @@ def test_depth_of_another_lens_is_that_of_the_training_camera(focal_px):
     K = np.array([[focal_px, 0, 31.5], [0, focal_px, 15.5], [0, 0, 1]])
     depth = np.linspace(1, 4, 64, dtype=np.float32)[None].repeat(32, 0)
     view = View(np.full((32, 64, 3), 90, np.uint8), depth, K)
-    batch = Supervised([Source("made", [view], 1.0)], METADATA, STILL).draw([Slot(0, 0, 0)])
+    batch = Supervised([Source("made", [view], 1.0)], METADATA, STILL).draw([Slot(0, 0, 0)])[0]
     expected = torch.from_numpy(depth) * (50.0 / focal_px)
     known = batch["mask"][0, 0] > 0
     assert known.float().mean() > 0.9

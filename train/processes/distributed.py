@@ -37,9 +37,10 @@ def process_group() -> Iterator[int]:
     if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
         yield 0
         return
-    # Imported later, as torch's optimisers do, default arguments in it would hold the group's threads till after the
+    # Imported later, as torch's optimisers do, default arguments in them would hold the group's threads till after the
     # interpreter's end, where one in thirty processes aborted (pytorch issue 190489).
-    importlib.import_module("torch._dynamo")
+    for name in ("torch._dynamo", "torch.distributed.nn.functional"):
+        importlib.import_module(name)
     try:
         dist.init_process_group("gloo", timeout=PATIENCE)
     except (ValueError, RuntimeError) as error:

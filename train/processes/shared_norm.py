@@ -1,11 +1,6 @@
 """Batch norm over the images of all processes; torch's own (`torch.nn.SyncBatchNorm`) runs on GPUs alone."""
 
-from typing import Any
-
-import torch
-import torch.distributed as dist
 from torch import Tensor, nn
-from torch.autograd.function import FunctionCtx
 
 from edgeslam_torch.train.processes.distributed import lost_is_said
 
@@ -49,26 +44,9 @@ def share_norms(network: nn.Module) -> None:
         setattr(network, name, shared)
 
 
-class _Everywhere(torch.autograd.Function):
-    """Sum over the processes. Each process's loss depends on it, so its gradient is the sum of theirs."""
-
-    @staticmethod
-    def forward(ctx: FunctionCtx, x: Tensor) -> Tensor:
-        return _summed(x)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        return _summed(gradients[0])
-
-
 def _everywhere(x: Tensor) -> Tensor:
-    found = _Everywhere.apply(x)
-    assert isinstance(found, Tensor)
-    return found
+    """Sum over the processes; each process's loss depends on it, so its gradient is the sum of theirs."""
+    from torch.distributed.nn.functional import all_reduce  # not in every build of torch
 
-
-def _summed(x: Tensor) -> Tensor:
-    total = x.detach().clone(memory_format=torch.contiguous_format)
     with lost_is_said():
-        dist.all_reduce(total)
-    return total
+        return all_reduce(x)

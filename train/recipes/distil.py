@@ -8,7 +8,8 @@
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -28,23 +29,19 @@ from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.layout import Variant
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
-from edgeslam_torch.train.folder import OutFolder
+from edgeslam_torch.train.folder import TEACHER, OutFolder
 from edgeslam_torch.train.hooks import Hooks
 from edgeslam_torch.train.inputs import posed_set
 from edgeslam_torch.train.processes.distributed import rank, world
 from edgeslam_torch.train.recipes.finetune import Data, finetune
 from edgeslam_torch.train.result import TrainingResult
 from edgeslam_torch.train.state import TrainConfig
-from edgeslam_torch.train.teachers.cache import TeacherCache
-from edgeslam_torch.train.teachers.teach import teach
+from edgeslam_torch.train.teachers.teach import at_points, kept_depth, log_metres, teach
 from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView
 from edgeslam_torch.types import FloatArray
 
 logger = logging.getLogger(__name__)
-
-ASKED = 24
-"""Views that say how many metres a map unit has."""
 
 
 def distil(
@@ -57,7 +54,7 @@ def distil(
     validation: Sequence[DepthFolder] = (),
     reading: Mapping[str, object] = MappingProxyType({}),
     hooks: Sequence[Hooks] = (),
-    cache: TeacherCache | None = None,
+    cache: Path | None = None,
     say: Callable[[str], None] = logger.info,
 ) -> TrainingResult:
     """Train ``student`` on the teacher's depth of ``runs``; resumes a training in ``out`` with the same inputs.
@@ -69,19 +66,15 @@ def distil(
         ConfigError: If neither the teacher nor a run gives metres; and as `finetune`.
         SourceError: As `label` and `finetune`.
     """
-    sha256 = file_hash(teacher.weights)
-    data, lines = Data(validation=list(validation)), []
-    for number, run in enumerate(runs):
+    root, sha256 = cache or subfolder(out.path, TEACHER), file_hash(teacher.weights)
+    data = Data(validation=list(validation))
+    for run in runs:
         if not (teacher.is_metric or run.metric):
             raise ConfigError(f"{run.name}: neither the teacher nor the run gives metres; add telemetry to it")
-        scale = None if teacher.is_metric else 0.0
-        folder = subfolder(out.path, "labels") / f"{number}-{run.name}-{sha256[:12]}"
-        if cache is not None:
-            folder = cache.entry(run.name, str(posed_set(run).sha256), sha256, repr(scale))
-        labels = label(teacher, run, scale, folder)
-        data.labelled.append(labels.folder)
-        lines.append(labels.describe())
-    for line in (*lines, *data.describe()) if rank() == 0 else ():
+        log_scale = log_metres(partial(usable_depth, teacher), run) if teacher.is_metric else 0.0
+        content = posed_set(run).sha256, sha256, log_scale
+        data.labelled.append(label(teacher, run, log_scale, kept_depth(root, run.name, *content)))
+    for line in data.describe() if rank() == 0 else ():
         say(line)
     return finetune(student, metadata, data, config, out, reading=reading, hooks=hooks, calibrate=True)
 
@@ -113,39 +106,19 @@ def _copied(new: nn.Module, old: nn.Module) -> bool:
     return True
 
 
-@dataclass(frozen=True, slots=True)
-class Labels:
-    """What a teacher says about a run's views."""
-
-    folder: DepthFolder
-    measured: float
-    """Share of the pixels measured by the plane sweep."""
-    without: int
-    """Views in which the teacher does not agree with the map: only measured pixels count there."""
-
-    def describe(self) -> str:
-        """One line for the terminal."""
-        views = (
-            f"{self.folder.name}: {len(self.folder.views)} images, {100 * self.measured:.0f} % of their pixels measured"
-        )
-        return views + (f", {self.without} without the teacher's depth" if self.without else "")
-
-
-def label(teacher: DepthNetwork, sequence: PosedSequence, log_scale: float | None, folder: Path) -> Labels:
-    """Dense depth [m] of a run's views by a teacher.
+def label(teacher: DepthNetwork, sequence: PosedSequence, log_scale: float, folder: Path) -> DepthFolder:
+    """Dense depth [m] of a run's views by a teacher: measured where the plane sweep is confirmed, else the teacher's.
 
     Args:
         teacher: The larger network.
         sequence: The run.
-        log_scale: Log of metres per map unit; None to take the metres of a metric teacher.
-        folder: For depth maps, reused by a later call; of this run and this teacher alone.
+        log_scale: Log of metres per map unit.
+        folder: From `kept_depth`.
 
     Raises:
-        SourceError: If the teacher gives no metres and none are given, or it agrees with no view of the map.
+        SourceError: If the teacher agrees with no view of the map.
         OSError: If a file cannot be written.
     """
-    if log_scale is None:
-        log_scale = log_metres(teacher, sequence)
     without: list[str] = []
 
     def predict(view: PosedView) -> FloatArray:
@@ -159,52 +132,28 @@ def label(teacher: DepthNetwork, sequence: PosedSequence, log_scale: float | Non
     views = [t.view for t in taught if (t.view.depth_m > 0).any()]
     if not views or (len(without) == len(taught) and world() == 1):
         raise SourceError(f"{sequence.name}: {teacher.weights.name} agrees with the map in none of its views")
-    measured = float(np.mean([t.measured.mean() for t in taught]))
-    return Labels(DepthFolder(sequence.name, views, tuple(without)), measured, len(without))
-
-
-def log_metres(teacher: DepthNetwork, sequence: PosedSequence) -> float:
-    """Log of metres per map unit by a metric teacher: the median over views of the median over their points.
-
-    Raises:
-        SourceError: If the teacher is relative, or gives no depth at the map's points.
-    """
-    if not teacher.is_metric:
-        raise SourceError(f"{teacher.weights.name}: gives no metres")
-    chosen = np.unique(np.linspace(0, len(sequence.views) - 1, min(ASKED, len(sequence.views))).astype(int))
-    ratios = []
-    for view in (sequence.views[int(i)] for i in chosen):
-        ratio = np.log(_at_points(_depth(teacher, view)[0], view) / view.z)
-        ratios += [float(np.median(ratio[np.isfinite(ratio)]))] if np.isfinite(ratio).any() else []
-    if not ratios:
-        raise SourceError(f"{sequence.name}: {teacher.weights.name} gives no depth at the map's points")
-    return float(np.median(ratios))
+    if without:
+        logger.warning(
+            "%s: %d images without the teacher's depth: it disagrees with the map", sequence.name, len(without)
+        )
+    return DepthFolder(sequence.name, views, tuple(without))
 
 
 def brought_to_map(teacher: DepthNetwork, view: PosedView, log_scale: float) -> FloatArray | None:
-    """The teacher's depth [m] of a view ``(H, W)``, scaled to the map's points in it; NaN where the teacher gives none.
-
-    None if it does not agree with them.
-    """
-    depth, is_relative = _depth(teacher, view)
-    at_points = _at_points(depth, view)
-    metres = view.z.astype(np.float64) * np.exp(log_scale)
-    if is_relative:
-        line = fit_inverse(at_points, metres)
+    """The teacher's depth [m] of a view ``(H, W)``, scaled to the map's points in it (by scale and shift of inverse
+    depth, when it is relative); NaN where the teacher gives none. None if it does not agree with them."""
+    depth = usable_depth(teacher, view)
+    seen, metres = at_points(depth, view), view.z.astype(np.float64) * np.exp(log_scale)
+    if not teacher.is_metric:
+        line = fit_inverse(seen, metres)
         return None if line is None else np.asarray(line.depth(depth), np.float32)
-    scale = fit_to_anchors(at_points, metres)
+    scale = fit_to_anchors(seen, metres)
     return None if scale is None else np.asarray(depth * np.exp(scale.log_ratio), np.float32)
 
 
-def _depth(teacher: DepthNetwork, view: PosedView) -> tuple[FloatArray, bool]:
-    """The teacher's depth ``(H, W)``, NaN where it is not usable; whether it is relative."""
+def usable_depth(teacher: DepthNetwork, view: PosedView) -> FloatArray:
+    """The teacher's depth ``(H, W)``, relative or [m]; NaN where it is not usable."""
     height, width = view.image.shape[:2]
     K = view.K
     found = teacher(view.image, Camera(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    return np.where(usable(found), found.depth_m, np.float32(np.nan)), found.is_relative
-
-
-def _at_points(depth: FloatArray, view: PosedView) -> FloatArray:
-    height, width = depth.shape
-    at = np.clip(np.rint(view.uv), 0, (width - 1, height - 1)).astype(int)
-    return depth[at[:, 1], at[:, 0]].astype(np.float64)
+    return np.where(usable(found), found.depth_m, np.float32(np.nan))

@@ -4,19 +4,19 @@ import copy
 import dataclasses
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+from torch.utils.data import Subset
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.plain import subfolder
-from edgeslam_torch.models.checkpoint import load_checkpoint, restored, save_checkpoint
+from edgeslam_torch.models.checkpoint import restored, save_checkpoint
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
@@ -27,16 +27,14 @@ from edgeslam_torch.train.inputs import HOOKS, Inputs, labelled_set, posed_set, 
 from edgeslam_torch.train.processes.distributed import by_first, rank
 from edgeslam_torch.train.recipe import BEST, FINAL, train
 from edgeslam_torch.train.result import TrainingResult
-from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
-from edgeslam_torch.train.signals import Signal, Source, Supervised
+from edgeslam_torch.train.self_supervised import SelfSupervised
+from edgeslam_torch.train.signals import Signal, Source, Supervised, Views
 from edgeslam_torch.train.state import TrainConfig, TrainState
-from edgeslam_torch.train.teachers.cache import TeacherCache
-from edgeslam_torch.train.teachers.teach import Taught, teach
-from edgeslam_torch.train.validate import DepthScores, can_be_scored, metres_by, predict_metres, score
+from edgeslam_torch.train.teachers.teach import Taught, kept_depth, log_metres, teach
+from edgeslam_torch.train.validate import DepthScores, can_be_scored, metres_by, score
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import DepthFolder
-from edgeslam_torch.train.views.labels import check_labels
-from edgeslam_torch.train.views.posed import PosedSequence, PosedView
+from edgeslam_torch.train.views.posed import PosedSequence
 
 logger = logging.getLogger(__name__)
 
@@ -96,7 +94,7 @@ def finetune(
     from_runs: FromRuns = FromRuns.TEACHER,
     reading: Mapping[str, object] = MappingProxyType({}),
     hooks: Sequence[Hooks] = (),
-    cache: TeacherCache | None = None,
+    cache: Path | None = None,
     calibrate: bool = False,
 ) -> TrainingResult:
     """Train ``network`` on ``data``; resumes a training in ``out`` with the same inputs.
@@ -131,12 +129,9 @@ def finetune(
     )
     if (done := by_first(lambda: out.finished(given))) is not None:
         return dataclasses.replace(done, nothing_to_do=True)
-    shipped, its_metadata = load_checkpoint()
-    labelled = [*data.labelled, *data.validation]
-    by_first(lambda: check_labels(labelled, lambda view: predict_metres(shipped, its_metadata, view)[0]))
     by_first(lambda: out.begin(given))
     start = copy.deepcopy(network).eval()
-    signals, held_out = _prepared(start, metadata, data, from_runs, _kept_in(cache, out))
+    signals, held_out = _prepared(start, metadata, data, from_runs, cache or subfolder(out.path, TEACHER))
     before = by_first(lambda: score(start, metadata, held_out)) if held_out else None
     tuned = _tuned_metadata(metadata, data)
     watching = list(hooks)
@@ -169,23 +164,24 @@ def settings_of(
 
 
 def _prepared(
-    start: DepthModule, metadata: Metadata, data: Data, from_runs: FromRuns, kept_in: Callable[[int, str, str], Path]
+    start: DepthModule, metadata: Metadata, data: Data, from_runs: FromRuns, kept_in: Path
 ) -> tuple[list[Signal], list[View]]:
     """Training signals, and the views to validate on.
 
-    Runs in arbitrary units are scaled to the network's own depth.
+    Runs in arbitrary units are scaled to the network's own depth. ``kept_in`` is where measured depth is kept.
     """
     signals: list[Signal] = []
     labelled, held_out = _split(data.labelled, keep_all=bool(data.validation))
     if labelled:
         signals.append(Supervised(labelled, metadata))
     if data.posed:
-        scales = [0.0 if s.metric else fit_log_scale(*_points_and_depths(start, metadata, s)) for s in data.posed]
+        own = metres_by(start, metadata)
+        scales = [0.0 if s.metric else log_metres(own, s) for s in data.posed]
         if from_runs is not FromRuns.PAIRS:
             sources = []
-            for k, (sequence, scale) in enumerate(zip(data.posed, scales, strict=True)):
-                content = repr((posed_set(sequence).sha256, weights_name(start, metadata), scale))
-                taught = teach(metres_by(start, metadata), sequence, scale, kept_in(k, sequence.name, content))
+            for sequence, scale in zip(data.posed, scales, strict=True):
+                content = posed_set(sequence).sha256, weights_name(start, metadata), scale
+                taught = teach(own, sequence, scale, kept_depth(kept_in, sequence.name, *content))
                 if not (data.validation or labelled):
                     held_out += [_measured_only(t) for t in taught[::HELD_OUT]]
                     taught = [t for i, t in enumerate(taught) if i % HELD_OUT]
@@ -198,51 +194,19 @@ def _prepared(
     return signals, [v for v in held_out if can_be_scored(v)]  # none, for a flight high above the ground
 
 
-def _kept_in(cache: TeacherCache | None, out: OutFolder) -> Callable[[int, str, str], Path]:
-    """Where depth of the k-th run is kept, by its number, name and all that it depends on."""
-
-    def place(number: int, name: str, content: str) -> Path:
-        return subfolder(out.path, TEACHER) / f"{number}-{name}" if cache is None else cache.entry(name, content)
-
-    return place
-
-
 def _split(folders: Sequence[DepthFolder], keep_all: bool) -> tuple[list[Source], list[View]]:
     """Training sources, and every tenth view to validate on unless all are kept for training."""
     held_out: list[View] = []
     sources = []
     for folder in folders:
-        views = folder.views
+        views: Views = folder.views
         if not keep_all and len(views) > 1:
             every = max(HELD_OUT, math.ceil(len(views) / MOST_HELD_OUT))
-            held_out += list(views[::every])
-            views = _WithoutEvery(views, every)
+            held_out += [views[i] for i in range(0, len(views), every)]
+            # Those of shards are not read before they are drawn.
+            views = Subset(views, [i for i in range(len(views)) if i % every])  # type: ignore[arg-type]
         sources.append(Source(folder.name, views, 1.0))
     return sources, held_out
-
-
-class _WithoutEvery(Sequence[View]):
-    """All views but those whose number is a multiple of ``every``, read on access."""
-
-    def __init__(self, views: Sequence[View], every: int) -> None:
-        self._views, self._every = views, every
-
-    def __len__(self) -> int:
-        return len(self._views) - math.ceil(len(self._views) / self._every)
-
-    @overload
-    def __getitem__(self, index: int) -> View: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[View]: ...
-
-    def __getitem__(self, index: int | slice) -> View | list[View]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        if not -len(self) <= index < len(self):
-            raise IndexError(index)
-        index %= len(self)
-        return self._views[index + index // (self._every - 1) + 1]
 
 
 def _measured_only(taught: Taught) -> View:
@@ -299,20 +263,6 @@ def _metrics(scores: DepthScores) -> dict[str, float]:
     """By name; ``score`` is what decides. Figures without any image are omitted."""
     found = {k: v for k, v in dataclasses.asdict(scores).items() if math.isfinite(v)}
     return {"score": scores.abs_rel_scaled, **found}
-
-
-def _points_and_depths(
-    network: DepthModule, metadata: Metadata, sequence: PosedSequence, most: int = 24
-) -> tuple[list[PosedView], list[np.ndarray]]:
-    """Some views, and the network's log depth at their map points."""
-    chosen = np.linspace(0, len(sequence.views) - 1, min(most, len(sequence.views))).astype(int)
-    views = [sequence.views[int(i)] for i in chosen]
-    return views, [_at_points(network, metadata, v) for v in views]
-
-
-def _at_points(network: DepthModule, metadata: Metadata, view: PosedView) -> np.ndarray:
-    depth, _ = predict_metres(network, metadata, View(view.image, np.zeros(view.image.shape[:2], np.float32), view.K))
-    return np.log(map_coordinates(depth, view.uv[:, ::-1].T, order=1, mode="nearest"))
 
 
 def _pictures(data: Data, held_out: Sequence[View]) -> list[View]:

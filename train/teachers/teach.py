@@ -4,6 +4,7 @@ Each view is swept against its neighbours (`plane_sweep`); pixels whose depth is
 The rest is the network's depth, corrected towards those pixels and the map's points (`densify`).
 """
 
+import hashlib
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeslam_torch import __version__
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.files.plain import subfolder
 from edgeslam_torch.terminal.progress import counted
@@ -38,6 +41,8 @@ ASKED = 6
 """Number of nearest views used for confirmation."""
 SPACING = 4
 """Every n-th confirmed pixel corrects the network's depth around it."""
+LOOKED_AT = 24
+"""Views that say how many metres a map unit has."""
 
 
 Predict = Callable[[PosedView], FloatArray]
@@ -63,6 +68,40 @@ class Taught:
     """``(H, W)``: where its depth was measured; elsewhere the network's own was completed."""
 
 
+def kept_depth(root: Path, name: str, *content: object) -> Path:
+    """Folder in ``root`` for the depth of a run, named by a hash of all that it depends on.
+
+    Args:
+        root: Of one training, or of several that share their depth.
+        name: Of the run, for people.
+        content: Hash of images, poses and map points; the network; the scale.
+    """
+    return root / f"{name}-{hashlib.sha256(repr((content, __version__)).encode()).hexdigest()[:24]}"
+
+
+def log_metres(predict: Predict, sequence: PosedSequence) -> float:
+    """Log of metres per map unit by a network: the median over views of the median over their points.
+
+    Raises:
+        SourceError: If the network gives no depth at the map's points.
+    """
+    ratios = []
+    for i in np.unique(np.linspace(0, len(sequence.views) - 1, LOOKED_AT).astype(int)).tolist():
+        view = sequence.views[i]
+        ratio = np.log(at_points(predict(view), view) / view.z)
+        ratios += [float(np.median(ratio[np.isfinite(ratio)]))] if np.isfinite(ratio).any() else []
+    if not ratios:
+        raise SourceError(f"{sequence.name}: the network gives no depth at the map's points")
+    return float(np.median(ratios))
+
+
+def at_points(depth: FloatArray, view: PosedView) -> FloatArray:
+    """Values of a map ``(H, W)`` at the map points of a view, ``(N,)``."""
+    height, width = depth.shape
+    at = np.clip(np.rint(view.uv), 0, (width - 1, height - 1)).astype(int)
+    return depth[at[:, 1], at[:, 0]].astype(np.float64)
+
+
 def teach(predict: Predict, sequence: PosedSequence, log_scale: float, folder: Path) -> list[Taught]:
     """Views of a run with dense depth [m]; the processes of a group share the work by way of ``folder``.
 
@@ -72,7 +111,7 @@ def teach(predict: Predict, sequence: PosedSequence, log_scale: float, folder: P
         predict: Fills unmeasured pixels.
         sequence: The run.
         log_scale: Log of metres per map unit.
-        folder: For the depth maps of this run, this network and this scale alone; made when missing.
+        folder: From `kept_depth`; made when missing.
 
     Raises:
         OSError: If the file cannot be written.

@@ -13,10 +13,10 @@ import io
 import json
 import logging
 import tarfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import overload
 
 import cv2
 import numpy as np
@@ -45,19 +45,22 @@ PER_SHARD = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class _Place:
-    """Where a file lies in its tar."""
-
-    offset: int
-    size: int
-
-
-@dataclass(frozen=True, slots=True)
 class _Sample:
     shard: Path
     name: str
-    files: dict[str, _Place]
-    """By extension."""
+    files: dict[str, tuple[int, int]]
+    """By extension: offset and size in the tar [bytes]."""
+
+    def read(self, extension: str, last: int | None = None) -> bytes:
+        """A file, or its last bytes."""
+        offset, size = self.files[extension]
+        length = size if last is None else min(last, size)
+        with self.shard.open("rb") as file:
+            file.seek(offset + size - length)
+            content = file.read(length)
+        if len(content) != length:
+            raise ValueError("the file is shorter than when training began")
+        return content
 
 
 class ShardedViews(Sequence[View]):
@@ -74,20 +77,12 @@ class ShardedViews(Sequence[View]):
     def __len__(self) -> int:
         return len(self._samples)
 
-    @overload
-    def __getitem__(self, index: int) -> View: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> "ShardedViews": ...
-
-    def __getitem__(self, index: int | slice) -> "View | ShardedViews":
-        """One view, or the unread views of a slice.
+    def __getitem__(self, index: int) -> View:  # type: ignore[override]  # no slices
+        """One view.
 
         Raises:
             SourceError: If the sample cannot be read; names it.
         """
-        if isinstance(index, slice):
-            return ShardedViews(self._samples[index], self._width)
         sample = self._samples[index]
         try:
             return reduced(_decoded(sample), self._width)
@@ -146,24 +141,19 @@ def write_shards(views: Iterable[View], out: Path, name: str, per_shard: int = P
         OSError: If a file cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    written: list[Path] = []
-    batch: list[View] = []
-    for view in views:
-        batch.append(view)
-        if len(batch) == per_shard:
-            written.append(_write(batch, out, name, len(written) * per_shard))
-            batch = []
-    if batch:
-        written.append(_write(batch, out, name, len(written) * per_shard))
+    rest, first, written = iter(views), 0, list[Path]()
+    while batch := list(islice(rest, per_shard)):
+        written.append(_write(batch, out, name, first))
+        first += len(batch)
     return written
 
 
-def _samples_of(shard: Path) -> Iterator[_Sample]:
+def _samples_of(shard: Path) -> list[_Sample]:
     """Samples in order; WebDataset keeps the files of one beside each other."""
+    samples: list[_Sample] = []
     try:
         size = shard.stat().st_size
         with tarfile.open(shard, "r:") as tar:
-            name, files = "", dict[str, _Place]()
             for member in tar:
                 if not member.isfile():
                     continue
@@ -171,27 +161,20 @@ def _samples_of(shard: Path) -> Iterator[_Sample]:
                     raise SourceError(f"{shard}: is cut off in {member.name}")
                 folder, _, file = member.name.rpartition("/")
                 stem, _, extension = file.partition(".")
-                key = f"{folder}/{stem}" if folder else stem
-                if key != name and files:
-                    yield _Sample(shard, name, files)
-                    files = {}
-                name = key
-                files[extension.lower()] = _Place(member.offset_data, member.size)
-            if files:
-                yield _Sample(shard, name, files)
+                name = f"{folder}/{stem}" if folder else stem
+                if not samples or samples[-1].name != name:
+                    samples.append(_Sample(shard, name, {}))
+                samples[-1].files[extension.lower()] = member.offset_data, member.size
     except (OSError, tarfile.TarError) as error:
         raise SourceError(
             f"{shard}: no tar file that can be read in place ({error}); compressed ones: gunzip"
         ) from error
+    return samples
 
 
 def _fingerprint(sample: _Sample) -> bytes:
     """Names, sizes and last bytes of its files, where a png has its checksum; reading all may take hours."""
-    ends = []
-    with sample.shard.open("rb") as file:
-        for name, place in sorted(sample.files.items()):
-            length = min(TAIL, place.size)
-            ends.append((name, place.size, _read(file, _Place(place.offset + place.size - length, length))))
+    ends = [(name, size, sample.read(name, TAIL)) for name, (_, size) in sorted(sample.files.items())]
     return repr((sample.shard.name, sample.name, ends)).encode()
 
 
@@ -204,8 +187,7 @@ def _missing(sample: _Sample) -> str:
 
 def _decoded(sample: _Sample) -> View:
     image_kind, depth_kind = (next(k for k in kinds if k in sample.files) for kinds in (IMAGES, DEPTHS))
-    with sample.shard.open("rb") as file:
-        content = {kind: _read(file, sample.files[kind]) for kind in (image_kind, depth_kind, "json")}
+    content = {kind: sample.read(kind) for kind in (image_kind, depth_kind, "json")}
     record = json.loads(content["json"])
     if not isinstance(record, dict):
         raise ValueError("json: no table")
@@ -246,14 +228,6 @@ def _check_size(content: bytes, kind: str) -> None:
         raise ValueError(f"{kind}: no image")
     if size[0] * size[1] > MAX_PIXELS:
         raise ValueError(f"{kind}: {size[0]}x{size[1]} px")
-
-
-def _read(file: io.BufferedReader, place: _Place) -> bytes:
-    file.seek(place.offset)
-    content = file.read(place.size)
-    if len(content) != place.size:
-        raise ValueError("the file is shorter than when training began")
-    return content
 
 
 def _write(views: Sequence[View], out: Path, name: str, first: int) -> Path:

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from edgeslam_torch.train.recipes.finetune import FromRuns
     from edgeslam_torch.train.result import TrainingResult
     from edgeslam_torch.train.state import TrainConfig
-    from edgeslam_torch.train.teachers.cache import TeacherCache
     from edgeslam_torch.train.views.datasets import DepthFolder
     from edgeslam_torch.train.views.posed import PosedSequence
 
@@ -88,9 +87,6 @@ def add_shared_arguments(parser: argparse.ArgumentParser, steps: int, batch: int
         metavar="FOLDER",
         help="keep the teacher's depth here for other trainings on the same runs (default: in --out, for this one)",
     )
-    parser.add_argument(
-        "--cache-gb", type=float, default=10.0, help="remove what was used longest ago from --cache beyond this"
-    )
     parser.add_argument("--camera", help="calibration for recordings without one")
     parser.add_argument(
         "--hook",
@@ -111,10 +107,6 @@ def check_shared(args: argparse.Namespace) -> None:
         raise ConfigError(f"--threads must be 1 to {MAX_THREADS}, got {args.threads}")
     if args.max_frames is not None and args.max_frames < 1:
         raise ConfigError(f"--max-frames must be at least 1, got {args.max_frames}")
-    if not args.cache_gb > 0:
-        raise ConfigError(f"--cache-gb must be above 0, got {args.cache_gb:g}")
-    if args.cache is not None and args.cache.exists() and not args.cache.is_dir():
-        raise ConfigError(f"--cache {args.cache}: is no folder")
     from edgeslam_torch.models.device import find_device
 
     find_device(args.device)
@@ -330,19 +322,6 @@ def posed_run(
         folder = subfolder(out.path, "slam") / item.name
         by_first(lambda: ensure_run(item.path, folder, weights, camera, max_frames, out.path))
     return load_run(folder, max_frames=max_frames)
-
-
-def teacher_cache(args: argparse.Namespace) -> "TeacherCache | None":
-    """Where ``--cache`` keeps the teacher's depth, made to fit ``--cache-gb``."""
-    from edgeslam_torch.train.processes.distributed import by_first
-    from edgeslam_torch.train.teachers.cache import GB, TeacherCache
-
-    if args.cache is None:
-        return None
-    cache = TeacherCache(args.cache, int(args.cache_gb * GB))
-    if removed := by_first(cache.shrink):
-        logger.info("%s: removed %s", args.cache, ", ".join(removed))
-    return cache
 
 
 def validation_folders(paths: Sequence[Path]) -> "list[DepthFolder]":

@@ -14,7 +14,6 @@ from edgeslam_torch.commands.training._inputs import (
     items_of,
     posed_run,
     say,
-    teacher_cache,
     train_config,
     validation_folders,
 )
@@ -105,6 +104,6 @@ def _distil(
     name = f"{teacher.weights.name} {file_hash(teacher.weights)[:12]}"
     reading = {"teacher": name, "max_frames": args.max_frames, "camera": args.camera}
     check_folder(args, out, (student, metadata), [(item.name, "depth") for item in items], config, reading, hooks)
-    cache, validation = teacher_cache(args), validation_folders(args.validate)
+    validation = validation_folders(args.validate)
     runs = (replace(posed_run(item, out, args.camera, args.max_frames), name=item.name) for item in items)
-    return distil(student, metadata, teacher, runs, config, out, validation, reading, hooks, cache, say)
+    return distil(student, metadata, teacher, runs, config, out, validation, reading, hooks, args.cache, say)

@@ -14,7 +14,6 @@ from edgeslam_torch.commands.training._inputs import (
     labelled_folder,
     posed_run,
     say,
-    teacher_cache,
     train_config,
     validation_folders,
 )
@@ -94,7 +93,7 @@ def _finetune(
         say(line)
     if not args.overwrite and 0 < (step := out.step) < args.steps:
         say(f"{out.path}: goes on after step {step}")
-    return finetune(network, metadata, data, config, out, from_runs, reading, hooks, teacher_cache(args))
+    return finetune(network, metadata, data, config, out, from_runs, reading, hooks, args.cache)
 
 
 def _data(args: argparse.Namespace, items: list[Item], out: "OutFolder") -> "Data":

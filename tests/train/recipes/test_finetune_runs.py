@@ -139,23 +139,6 @@ def test_depth_in_the_cache_is_measured_once_for_two_trainings(run_folder, tmp_p
     assert len(list((tmp_path / "cache").iterdir())) == 2
 
 
-@pytest.mark.slow
-def test_teacher_of_other_weights_is_made_anew(run_folder, tmp_path, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(teacher, "_completed", interrupted)
-        assert command.main(arguments(tmp_path, run_folder)) == EXIT_INTERRUPTED
-    stale = tmp_path / "out" / "teacher" / "0-run" / "swept_0.npy"
-    stale.write_bytes(b"of the weights before")
-    torch.manual_seed(7)
-    other = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
-    save_checkpoint(other, METADATA, tmp_path / "start.safetensors")
-    assert command.main(arguments(tmp_path, run_folder)) == 0
-    assert stale.stat().st_size > 1000
-
-
 def test_run_without_a_useful_pair_is_named_and_gives_no_name(run_folder, tmp_path, caplog):
     sequence = load_run(run_folder)
     still = replace(sequence, name="hovering", partners=[()] * len(sequence.views))
