@@ -12,11 +12,12 @@ from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.files.imu_files import MODEL, READINGS
 from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ, SECONDS, record_flight, simulated_camera
+from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ, SECONDS, simulated_camera
 from edgeslam_torch.synthetic.flights.degrade import CLEAN, CameraFaults
 from edgeslam_torch.synthetic.flights.flight import Flight
 from edgeslam_torch.synthetic.flights.imu import MPU6050
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults
+from edgeslam_torch.synthetic.flights.writer import record_flight
 from edgeslam_torch.synthetic.house.world import World
 
 WORLDS = {name: COURSES[name] for name in ("room", "corridor", "block")}
@@ -93,7 +94,7 @@ def record(folder: Path, settings: DemoSettings, on_frame: Callable[[int], None]
     rng = np.random.default_rng(settings.seed)
     course = WORLDS[settings.world]
     world = course.world(rng)
-    flight = course.pilot(rng, world, settings.frames, rate_hz=settings.rate_hz)
+    flight = course.fly(rng, world, settings.frames, settings.rate_hz)
     record_flight(
         folder,
         world,

@@ -19,9 +19,9 @@ from edgeslam_torch.synthetic.flights.courses import (
     RATE_HZ,
     flown,
     record_course,
-    record_flight,
     simulated_camera,
 )
+from edgeslam_torch.synthetic.flights.writer import record_flight
 from edgeslam_torch.synthetic.house.render import render
 
 NONE = ("noise", "black", "frozen")
@@ -82,7 +82,7 @@ def _record_again(folder: Path, name: str, seed: int, flight: int) -> None:
     """Another flight through the world of a course."""
     course = COURSES[name]
     world, rng = course.world(np.random.default_rng(seed)), np.random.default_rng([seed, flight])
-    flown_again = course.pilot(rng, world, round(course.seconds * course.rate_hz), rate_hz=course.rate_hz)
+    flown_again = course.fly(rng, world, round(course.seconds * course.rate_hz))
     camera = simulated_camera()
     record_flight(folder, world, flown_again, rng, camera, course.telemetry, course.faults, seed=seed + flight)
 

@@ -26,7 +26,7 @@ def built(scene):
 def flight_of(name):
     course, rng = COURSES[name], np.random.default_rng()
     world, rng.bit_generator.state = built(course.scene)
-    return world, course.pilot(rng, world, round(course.seconds * course.rate_hz), rate_hz=course.rate_hz)
+    return world, course.fly(rng, world, round(course.seconds * course.rate_hz))
 
 
 def turned_deg(flight):

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.flights.flight import FlightPlan, fly
+from edgeslam_torch.synthetic.flights.paths import inspect
 from edgeslam_torch.synthetic.sites.build import place
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
@@ -19,13 +20,13 @@ def home():
 
 @pytest.fixture(scope="module")
 def flight(home):
-    return fly(np.random.default_rng(3), home, 900)
+    return fly(np.random.default_rng(3), home, 900, inspect)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_flight_is_smooth_slow_and_clear_of_furniture(home, seed):
     plan = FlightPlan()
-    flight = fly(np.random.default_rng(seed), home, 900, plan=plan)
+    flight = fly(np.random.default_rng(seed), home, 900, inspect, plan=plan)
     speed = np.linalg.norm(flight.velocity_w, axis=1)
     assert np.median(speed) > 0.25
     assert speed.max() < 1.0
@@ -56,4 +57,4 @@ def test_twist_carries_one_pose_to_the_next(flight):
 
 def test_flight_without_air_is_refused(home):
     with pytest.raises(ValueError, match="free air"):
-        fly(np.random.default_rng(0), home, 30, plan=FlightPlan(clearance_m=4.0))
+        fly(np.random.default_rng(0), home, 30, inspect, plan=FlightPlan(clearance_m=4.0))

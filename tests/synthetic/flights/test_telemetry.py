@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.readers.telemetry_csv import read_telemetry
 from edgeslam_torch.synthetic.flights.flight import fly
+from edgeslam_torch.synthetic.flights.paths import inspect
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, FIELDS, TelemetryFaults, simulate
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
 
@@ -19,7 +20,7 @@ def flight():
     texture = Texture(np.zeros((4, 4, 3), np.uint8))
     floor = Quad(np.array([-4.0, 4.0, 0.0]), np.array([8.0, 0.0, 0.0]), np.array([0.0, -8.0, 0.0]), texture)
     room = World([floor], bounds_w=np.array([[-4.0, -4.0, 0.0], [4.0, 4.0, 2.6]]))
-    return fly(np.random.default_rng(3), room, 900)
+    return fly(np.random.default_rng(3), room, 900, inspect)
 
 
 def simulated(flight, faults=EXACT, **more):

@@ -5,7 +5,8 @@ import pytest
 
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.flights.courses import BUILDING_M
-from edgeslam_torch.synthetic.flights.flight import FlightPlan, fly_around
+from edgeslam_torch.synthetic.flights.flight import FlightPlan, fly
+from edgeslam_torch.synthetic.flights.paths import around
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.house.views import look
 from edgeslam_torch.synthetic.sites.build import JUDGED, named_site, place
@@ -123,7 +124,7 @@ def test_glass_is_hit_and_not_seen():
 def test_the_line_through_the_building_is_free_and_leads_into_all_ten_rooms():
     rng = np.random.default_rng(0)
     world = place("building", rng)
-    flight = fly_around(rng, world, 840, rate_hz=15.0, plan=FlightPlan(speed_m_s=0.8), sides_m=BUILDING_M)
+    flight = fly(rng, world, 840, around(BUILDING_M), rate_hz=15.0, plan=FlightPlan(speed_m_s=0.8))
     p = flight.T_w_b[:, :3, 3]
     assert world.clearance(p).min() > 0.3
     rooms = {(int(column), bool(row > 0)) for column, row in zip(np.floor(p[:, 0] / 4.0 + 2.5), p[:, 1], strict=True)}
