@@ -105,9 +105,9 @@ def _shape(scene: Scene, place: Place, values: Values, step: dict[str, Any]) -> 
         faces, inside = step.get("faces", "frblt"), step.get("inside", False)
         scene.box(place, at, size, paint, name, faces=faces, special=special, inside=inside)
     elif shape == "panel":
-        scene.panel(place, at, *size, paint, name)
+        scene.panel(place, at, size[0], size[1], paint, name)
     elif shape == "prism":
-        scene.prism(place, *size, paint, name, sides=step.get("sides", 8))
+        scene.prism(place, size[0], size[1], paint, name, sides=step.get("sides", 8))
     else:
         u, v = (place.direction(values(step[key])) for key in "uv")
         scene.surface(place.point(at), u, v, paint, name, two_sided=step.get("two_sided", False))

@@ -35,7 +35,7 @@ class Values:
             "random": rng.random,
             "either": lambda *options: options[int(rng.random() * len(options))],
             "choose": lambda *options: options[int(rng.choice(len(options)))],
-            "sample": lambda count, *options: set(rng.choice(options, count, replace=False).tolist()),
+            "sample": lambda count, *options: set(rng.choice(np.array(options), count, replace=False).tolist()),
             "steps": _steps,
             "min": min,
             "max": max,
