@@ -120,7 +120,7 @@ def _sampled(
     padded = np.vstack([np.repeat(control[:1], DEGREE, axis=0), control, np.repeat(control[-1:], DEGREE, axis=0)])
     knots = (np.arange(len(padded) + DEGREE + 1) - DEGREE) * KNOT_S
     spline = BSpline(knots, padded, DEGREE)
-    # Sum of a few sines: the drone's own unrest, smooth and zero at the start.
+    # Sum of a few sines: the drone's jitter, smooth and zero at the start.
     flown = stamps + begin_s
     fade = 1.0 - np.exp(-((flown / 1.5) ** 2))
     state, velocity, acceleration = (spline(flown, nu=k) for k in range(3))
