@@ -2,7 +2,7 @@
 
 `MotionFusion` receives frames and messages and delegates to its parts: `remembered` (messages, poses, delay, gates),
 `orientation` (map and camera in the drone's world), `scale_estimator` (the scale and its sources), `comparison`
-(validation of telemetry), `telemetry_scale`, `filter_feed` and `prediction`. Reading a result computes nothing: each
+(validation of telemetry), `telemetry_scale` and `filter_feed`. Reading a result computes nothing: each
 tracked frame may trigger a fit, whose results are valid until the next.
 """
 
@@ -17,15 +17,10 @@ from edgeslam_torch.estimation.config import INTERVAL_S, MAX_GAP_S, WINDOW_S, Fu
 from edgeslam_torch.estimation.dead_reckoning import REACH_S as RECKONED_S
 from edgeslam_torch.estimation.dead_reckoning import Reckoned, reckoned
 from edgeslam_torch.estimation.displacement import TelemetryModel
-from edgeslam_torch.estimation.filter.filter_feed import FilterFeed
+from edgeslam_torch.estimation.filter.filter_feed import FilterFeed, PoseEstimate
 from edgeslam_torch.estimation.health import disagreement
 from edgeslam_torch.estimation.orientation import Orientation
 from edgeslam_torch.estimation.output_frame import OutputFrame
-from edgeslam_torch.estimation.prediction import (
-    PoseEstimate,
-    by_filter,
-    by_vision,
-)
 from edgeslam_torch.estimation.remembered import Remembered
 from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
 from edgeslam_torch.estimation.sensors.imu import REACH_S as IMU_REACH_S
@@ -248,19 +243,11 @@ class MotionFusion:
         return self._filter.seen is not None
 
     def predict(self, stamp_s: float) -> PoseEstimate | None:
-        """Camera pose at a frame's stamp by the filter; at constant velocity while that has no scale or delay, or
-        telemetry has a gap or contradicts the images.
-
-        Returns:
-            The estimate in map units, or ``None`` before the first tracked frame.
-        """
-        last, previous = self._memory.last, self._memory.previous
-        if last is None:
-            return None
-        view = self._filter.view(stamp_s) if stamp_s > last.stamp_s else None
-        if view is not None:
-            return by_filter(view, self.scale(), self.flight.delay_sigma_s)
-        return by_vision(last, previous, stamp_s)
+        """Camera pose at a frame's stamp by the filter, in the map; None while it has no scale or delay, and where
+        telemetry has a gap or contradicts the images."""
+        last = self._memory.last
+        view = self._filter.view(stamp_s) if last is not None and stamp_s > last.stamp_s else None
+        return None if view is None else view.in_map(self.scale(), self.flight.delay_sigma_s)
 
     def republished(self, published: OutputFrame, centre_map: FloatArray, keep_scale: bool) -> OutputFrame:
         """The published frame, levelled and, unless ``keep_scale``, with the present scale or guess; the

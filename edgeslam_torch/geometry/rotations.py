@@ -28,6 +28,17 @@ def matrix_from_rpy(rpy: FloatArray) -> FloatArray:
     )
 
 
+def matrices_from_rpy(rpy: FloatArray) -> FloatArray:
+    """The same of many ``(N, 3)``, shape ``(N, 3, 3)``."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy).T, np.sin(rpy).T
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
 def rpy_from_matrix(R: FloatArray) -> FloatArray:
     """``(roll, pitch, yaw)`` [rad] of a rotation ``(3, 3)``; at a pitch of 90 degrees yaw and roll are ambiguous."""
     pitch = math.asin(max(-1.0, min(1.0, -float(R[2, 0]))))

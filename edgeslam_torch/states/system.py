@@ -11,7 +11,6 @@ from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.estimation.output_frame import OutputFrame, first_pose
-from edgeslam_torch.estimation.prediction import PoseEstimate
 from edgeslam_torch.estimation.scale.depth_scale import DepthRatio, compared
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
@@ -101,12 +100,10 @@ class System:
     # -- motion ------------------------------------------------------------------------------------------------
 
     def predict(self, stamp_s: float, lost: bool) -> FloatArray:
-        """Predicted ``T_c_w``: constant velocity over short gaps, telemetry over others; a gyroscope's rotation.
-
-        Telemetry goes through the Kalman filter once scale and delay are known.
-        """
+        """Predicted ``T_c_w``: by the Kalman filter over gaps and when lost, once it has scale and delay; otherwise at
+        constant velocity, with a gyroscope's rotation if there is one."""
         gap = stamp_s - self.motion.stamp_s >= MIN_GAP_S
-        if self.has_telemetry and (lost or self.motion.velocity_unknown or (gap and self.fusion.filtering)):
+        if self.has_telemetry and (lost or gap or self.motion.velocity_unknown):
             estimate = self.fusion.predict(stamp_s)
             if estimate is not None:
                 return se3.inverse(estimate.T_w_c)
@@ -143,11 +140,6 @@ class System:
         place = None if reckoned is None else Place(reckoned.R_w_m, reckoned.centre, reckoned.doubt)
         return SensorPrior(None if turned is None else Attitude(*turned), place)
 
-    def sensor_prediction(self, stamp_s: float) -> PoseEstimate | None:
-        """Pose predicted by the filter; None without it: constant velocity does not relate two submaps."""
-        predicted = self.fusion.predict(stamp_s)
-        return predicted if predicted is not None and predicted.source == "filter" else None
-
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""
         metre = 1.0 / self.published.scale if self.mapping.has_metres else None
@@ -177,7 +169,7 @@ class System:
 
     def begin_submap(self, keyframe: Keyframe) -> None:
         """A submap begins with a keyframe at the present, predicted pose."""
-        predicted = self.sensor_prediction(keyframe.stamp_s)
+        predicted = self.fusion.predict(keyframe.stamp_s)
         sigma = (np.inf, np.inf) if predicted is None else (predicted.sigma_t, predicted.sigma_r_rad)
         self.graph.begin(self.map.piece, keyframe, *sigma)
         self.fusion.begin_piece()

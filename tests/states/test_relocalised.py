@@ -8,7 +8,7 @@ import pytest
 
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.atlas.submap_graph import SubmapGraph
-from edgeslam_torch.estimation.prediction import PoseEstimate
+from edgeslam_torch.estimation.filter.filter_feed import PoseEstimate
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.states.tracking import Tracking
 from edgeslam_torch.types import ScaleEstimate
@@ -37,7 +37,7 @@ class Flown:
             for k in range(6)
         }
         self.piece_of = dict.fromkeys(range(6), 0)
-        self.predicted = PoseEstimate(6.0, placed(5.0), sigma, 0.01, "filter")
+        self.predicted = PoseEstimate(placed(5.0), sigma, 0.01)
         self.asked = []
         self.sees_again = {}
         """Anchors that the two newest keyframes share with others."""
@@ -66,7 +66,7 @@ class Flown:
             graph=graph,
             tracker=SimpleNamespace(local_keyframes=lambda anchor: [self.keyframes[0]]),
             log=log,
-            sensor_prediction=lambda stamp_s: self.predicted,
+            fusion=SimpleNamespace(predict=lambda stamp_s: self.predicted),
         )
 
     def finds(self, x, turned_deg=0.0):

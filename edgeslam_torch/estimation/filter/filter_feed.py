@@ -28,6 +28,17 @@ _DELAY_MOVED_S = 0.003
 
 
 @dataclass(frozen=True, slots=True)
+class PoseEstimate:
+    """Predicted camera pose in the map's own gauge."""
+
+    T_w_c: FloatArray
+    """``(4, 4)``, map units."""
+    sigma_t: float
+    """Standard deviation of the translation per axis [map units]."""
+    sigma_r_rad: float
+
+
+@dataclass(frozen=True, slots=True)
 class FilterView:
     """The filter's estimate at one stamp, relative to a visual pose of the map."""
 
@@ -49,6 +60,13 @@ class FilterView:
         late = self.velocity_m_s * delay_sigma_s
         covariance[:3, :3] += np.outer(way, way) + np.outer(late, late)
         return covariance
+
+    def in_map(self, scale: ScaleEstimate, delay_sigma_s: float) -> PoseEstimate:
+        """The estimate in the map's units."""
+        T = self.T_seen_c.copy()
+        T[:3, 3] /= scale.value
+        sigma = np.sqrt(np.diag(self.with_doubts(scale, delay_sigma_s)).reshape(3, 3).mean(axis=1)).tolist()
+        return PoseEstimate(self.seen.T @ T, sigma[0] / scale.value, sigma[1])
 
 
 class FilterFeed:

@@ -10,9 +10,8 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.geometry.rotations import matrix_from_rpy
+from edgeslam_torch.geometry.rotations import matrices_from_rpy
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
 _FROZEN_S = 1.5
@@ -89,12 +88,15 @@ class Turn(Enum):
         """Whether the drone itself reports velocities in axes that rotate with it."""
         return self in (Turn.FROM_BODY, Turn.FROM_LEANING_BODY)
 
-    def rotation(self, rpy: FloatArray) -> Rotation:
-        """Rotation of velocities at roll, pitch and yaw ``(N, 3)`` [rad]."""
-        if self is Turn.FROM_LEANING_BODY:
-            return Rotation.from_euler("ZYX", rpy[:, ::-1])
-        sign = {Turn.AS_READ: 0.0, Turn.FROM_BODY: 1.0, Turn.BACK: -1.0}[self]
-        return Rotation.from_euler("z", sign * rpy[:, 2:])
+    def rotation(self, rpy: FloatArray) -> FloatArray:
+        """Rotation of velocities ``(N, 3, 3)`` at roll, pitch and yaw ``(N, 3)`` [rad]."""
+        share = {
+            Turn.AS_READ: (0.0, 0.0, 0.0),
+            Turn.FROM_BODY: (0.0, 0.0, 1.0),
+            Turn.FROM_LEANING_BODY: (1.0, 1.0, 1.0),
+            Turn.BACK: (0.0, 0.0, -1.0),
+        }[self]
+        return matrices_from_rpy(rpy * share)
 
 
 class _Rows:
@@ -107,10 +109,14 @@ class _Rows:
         "tof_m": 7,
         "height_m": 8,
         "baro_m": 9,
+        "battery": 10,
     }
 
     def __init__(self) -> None:
-        self._buffer, self._count = np.empty((256, 10)), 0
+        self._buffer, self._count = np.empty((256, 11)), 0
+
+    def __len__(self) -> int:
+        return self._count
 
     def append(self, sample: TelemetrySample) -> None:
         """Append one sample."""
@@ -123,7 +129,7 @@ class _Rows:
     def drop(self, count: int) -> None:
         """Drop the oldest samples."""
         kept = self._buffer[count : self._count].copy()
-        self._buffer, self._count = np.concatenate([kept, np.empty((256, 10))]), len(kept)
+        self._buffer, self._count = np.concatenate([kept, np.empty((256, 11))]), len(kept)
 
     def copy(self) -> "_Rows":
         """An independent copy."""
@@ -131,9 +137,9 @@ class _Rows:
         out._buffer, out._count = self._buffer.copy(), self._count
         return out
 
-    def column(self, name: str) -> FloatArray:
-        """Copy of all values of a field."""
-        return np.array(self._buffer[: self._count, self.COLUMNS[name]])
+    def __getitem__(self, name: str) -> FloatArray:
+        """All values of a field; a view."""
+        return np.asarray(self._buffer[: self._count, self.COLUMNS[name]])
 
 
 class TelemetryTrack:
@@ -142,7 +148,6 @@ class TelemetryTrack:
     def __init__(self, velocity_frame: str, max_gap_s: float, keep_s: float = 900.0) -> None:
         self._body = velocity_frame == "body"
         self._max_gap_s, self._keep_s = max_gap_s, keep_s
-        self._samples: list[TelemetrySample] = []
         self._rows = _Rows()
         self._cached: Readings | None = None
         self._turn = Turn.AS_READ
@@ -157,15 +162,12 @@ class TelemetryTrack:
             if not (math.isfinite(sample.stamp_s) and sample.stamp_s > self.last_s and known):
                 self.refused += 1
                 continue
-            self._samples.append(sample)
             self._rows.append(sample)
             used.append(self._turned(sample))
         if used:
             self._cached = None
-            while self._samples[-1].stamp_s - self._samples[0].stamp_s > self._keep_s:
-                oldest = max(1, len(self._samples) // 10)
-                del self._samples[:oldest]
-                self._rows.drop(oldest)
+            while self.last_s - self._rows["stamp_s"][0] > self._keep_s:
+                self._rows.drop(max(1, len(self) // 10))
         return used
 
     @property
@@ -193,20 +195,22 @@ class TelemetryTrack:
     def _turned(self, sample: TelemetrySample) -> TelemetrySample:
         if self._turn is Turn.AS_READ or not np.isfinite(sample.rpy_rad).all():
             return sample
-        return replace(sample, velocity_m_s=self._turn.rotation(sample.rpy_rad[None]).apply(sample.velocity_m_s)[0])
+        return replace(sample, velocity_m_s=self._turn.rotation(sample.rpy_rad[None])[0] @ sample.velocity_m_s)
 
     def __len__(self) -> int:
-        return len(self._samples)
+        return len(self._rows)
 
     @property
     def last_s(self) -> float:
         """Stamp of the newest sample, minus infinity before the first."""
-        return float(self._samples[-1].stamp_s) if self._samples else -math.inf
+        return float(self._rows["stamp_s"][-1]) if len(self) else -math.inf
 
     @property
     def battery(self) -> float:
         """Newest charge in [0, 1]; NaN if the last messages have none."""
-        return next((s.battery for s in self._samples[: -_RECENT - 1 : -1] if math.isfinite(s.battery)), math.nan)
+        lately = self._rows["battery"][-_RECENT:]
+        told = lately[np.isfinite(lately)]
+        return float(told[-1]) if len(told) else math.nan
 
     @property
     def readings(self) -> Readings:
@@ -216,18 +220,18 @@ class TelemetryTrack:
         return self._cached
 
     def _build(self) -> Readings:
-        column = self._rows.column
-        stamp, reported, raw_rpy = column("stamp_s"), column("velocity_m_s"), column("rpy_rad")
+        rows = self._rows.copy()
+        stamp, reported, raw_rpy = rows["stamp_s"], rows["velocity_m_s"], rows["rpy_rad"]
         velocity, rpy = _filled(reported), np.unwrap(_filled(raw_rpy), axis=0)
         if self._turn is Turn.BACK:
-            velocity = self._turn.rotation(rpy).apply(velocity)
+            velocity = _applied(self._turn.rotation(rpy), velocity)
         sign = np.sign(np.where(np.abs(velocity) > 1e-6, velocity, 0.0))
         if self._turn.from_body:
             turn = self._turn.rotation(rpy)
-            velocity, sign = turn.apply(velocity), turn.apply(sign)
+            velocity, sign = _applied(turn, velocity), _applied(turn, sign)
         if self._body:
-            R = Rotation.from_euler("ZYX", rpy[:, ::-1])
-            velocity, sign = R.apply(velocity), R.apply(sign)
+            R = matrices_from_rpy(rpy)
+            velocity, sign = _applied(R, velocity), _applied(R, sign)
         return Readings(
             stamp_s=stamp,
             velocity=velocity,
@@ -235,9 +239,9 @@ class TelemetryTrack:
             sign=sign,
             sign_path=_integral(stamp, sign),
             rpy=rpy,
-            tof=column("tof_m"),
-            height=column("height_m"),
-            baro=column("baro_m"),
+            tof=rows["tof_m"],
+            height=rows["height_m"],
+            baro=rows["baro_m"],
             has_velocity=_all(np.isfinite(reported)),
             has_attitude=_known_lately(stamp, _all(np.isfinite(raw_rpy)), self._max_gap_s),
             frozen=_frozen(stamp, reported, raw_rpy),
@@ -250,7 +254,7 @@ class TelemetryTrack:
             stamps_s: Times ``(N,)`` [s].
             shortfall_m_s: Added to the magnitude of every non-zero reading: half a step when the drone truncates.
         """
-        if len(self._samples) < 2:
+        if len(self) < 2:
             return np.zeros((len(stamps_s), 3))
         reported = self.readings
         stamp = reported.stamp_s
@@ -262,7 +266,7 @@ class TelemetryTrack:
 
     def hovers(self, from_s: float, to_s: float) -> bool:
         """Whether every reading of an interval, up to the video's delay before its end, is of a hovering drone."""
-        if not self._samples:
+        if not len(self):
             return False
         reported = self.readings
         first, last = np.searchsorted(reported.stamp_s, (from_s, max(from_s, to_s - _LATE_S)))
@@ -274,17 +278,14 @@ class TelemetryTrack:
     def copy(self) -> "TelemetryTrack":
         """A copy for another thread."""
         out = TelemetryTrack("body" if self._body else "world", self._max_gap_s, self._keep_s)
-        out._samples, out._cached, out.refused = list(self._samples), self._cached, self.refused
-        out._rows, out._turn = self._rows.copy(), self._turn
+        out._rows, out._cached, out._turn, out.refused = self._rows.copy(), self._cached, self._turn, self.refused
         return out
 
     def attitude(self, stamps_s: FloatArray) -> FloatArray:
         """Body to power-on world ``(N, 3, 3)``."""
         reported = self.readings
         rpy = np.stack([np.interp(stamps_s, reported.stamp_s, angle) for angle in reported.rpy.T], axis=-1)
-        if len(rpy) == 1:
-            return matrix_from_rpy(rpy[0])[None]
-        return Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
+        return matrices_from_rpy(rpy)
 
     def leaned(self, stamps_s: FloatArray, reach_s: float) -> FloatArray:
         """Maximum rotation [rad] of the vertical in the body within ``reach_s`` of each stamp ``(N,)``; at least 0."""
@@ -309,7 +310,7 @@ class TelemetryTrack:
     def covered(self, from_s: FloatArray, to_s: FloatArray) -> NDArray[np.bool_]:
         """Whether each interval lies within readings without a gap, a frozen stretch, or a missing velocity or
         attitude."""
-        if len(self._samples) < 2:
+        if len(self) < 2:
             return np.zeros(len(from_s), dtype=bool)
         stamp, valid = self.readings.stamp_s, self.readings.valid
         bad = (np.diff(stamp) > self._max_gap_s) | ~valid[1:] | ~valid[:-1]
@@ -323,10 +324,10 @@ class TelemetryTrack:
     def axes(self) -> FloatArray:
         """Rotation from the axes of the velocity readings to the power-on world, at each reading ``(N, 3, 3)``."""
         rpy = self.readings.rpy
-        axes = np.broadcast_to(np.eye(3), (len(rpy), 3, 3))
+        axes: FloatArray = np.broadcast_to(np.eye(3), (len(rpy), 3, 3))
         if self._turn.from_body:
-            axes = self._turn.rotation(rpy).as_matrix()
-        return Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix() @ axes if self._body else axes
+            axes = self._turn.rotation(rpy)
+        return matrices_from_rpy(rpy) @ axes if self._body else axes
 
     def truncation_log_odds(self, step_m_s: float) -> float:
         """Log odds of truncation against rounding from the readings alone; 0 without sweeps through zero.
@@ -334,12 +335,11 @@ class TelemetryTrack:
         A velocity that sweeps from three steps below zero to three above (or back) passes all values equally often. A
         truncating drone then reads 0 over two steps, twice as often as +1 or -1; a rounding one over one step.
         """
-        if len(self._samples) < 20:
+        if len(self) < 20:
             return 0.0
         stamp = self.readings.stamp_s
-        reported = np.array([s.velocity_m_s for s in self._samples], dtype=np.float64)
         log_odds = 0.0
-        for v in np.rint(np.nan_to_num(reported) / step_m_s).T:
+        for v in np.rint(np.nan_to_num(self._rows["velocity_m_s"]) / step_m_s).T:
             far = np.flatnonzero(np.abs(v) >= 3)
             for i, j in zip(far[:-1], far[1:], strict=True):
                 if v[i] * v[j] < 0 and j - i > 1 and stamp[j] - stamp[i] < 4.0:
@@ -350,11 +350,11 @@ class TelemetryTrack:
     @property
     def has_attitude(self) -> bool:
         """Whether any sample has roll, pitch and yaw."""
-        return any(np.isfinite(sample.rpy_rad).all() for sample in self._samples)
+        return bool(_all(np.isfinite(self._rows["rpy_rad"])).any())
 
     def warnings(self) -> list[str]:
         """Problems visible in the readings alone."""
-        if len(self._samples) < 2:
+        if len(self) < 2:
             return []
         frozen = self.readings.frozen
         if not frozen.any():
@@ -368,7 +368,7 @@ class TelemetryTrack:
 
     def heights(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Readings of each height source: name to (stamps, metres above floor or take-off)."""
-        return self.readings.heights if self._samples else {}
+        return self.readings.heights if len(self) else {}
 
 
 def _heights(reported: Readings) -> dict[str, tuple[FloatArray, FloatArray]]:
@@ -395,6 +395,11 @@ def _integral(stamp: FloatArray, velocity: FloatArray) -> FloatArray:
     h_squared = np.where(h < 0.5, h**2, 0.0)  # no curvature across a gap
     steps = 0.5 * h * (velocity[1:] + velocity[:-1]) + h_squared / 8.0 * (slope[:-1] - slope[1:])
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+def _applied(R: FloatArray, v: FloatArray) -> FloatArray:
+    """Vectors ``(N, 3)`` rotated by ``(N, 3, 3)``."""
+    return np.asarray(np.einsum("nij,nj->ni", R, v))
 
 
 def _all(true: NDArray[np.bool_]) -> NDArray[np.bool_]:
