@@ -94,6 +94,9 @@ VISUAL_JITTER_M, VISUAL_JITTER_RAD = 0.002, 0.001
 MAP_DRIFT_M, MAP_DRIFT_MEMORY_S = (0.03, 0.002), 4.0
 """Of the map's local distortion, usual first, of which the residuals choose: the error of a position against those
 seconds before, and its correlation time."""
+MAP_PIVOT_M = 0.02
+"""Of the point about which the map takes a rotation to be, per axis: where depths are off, a part of each rotation is
+taken for a translation, the same whenever the rotation recurs. It decides where a camera turns and hardly moves."""
 MAP_WANDER_LOG = (0.03, 0.09, 0.27, 0.81)
 """Change of the log of the map's scale per e-fold of its age, usual first, of which the residuals choose: 2 to 14 % in
 the first seconds, later 1 to 2 %; with few features the scale may triple."""

@@ -395,7 +395,7 @@ class MotionFusion:
 
         metres.take(*scale(self._trust).beliefs(), self._trust)
         guesses = flying and metres.sensor_scale is None
-        metres.provisional_scale(scale(self._trust.supposing_heights()).beliefs()[0] if guesses else {})
+        metres.provisional_scale((scale(self._trust.supposing_heights()).beliefs()[0] or {}) if guesses else {})
         oldest = self._memory.sightings().stamps_s[0]
         self._drift = drift_in_words(self.scale_around, float(oldest), last.stamp_s)
 

@@ -69,24 +69,24 @@ class ScaleEstimator:
         if scale is not None and math.isfinite(scale.sigma):
             self._remembered = ScaleBelief(math.log(scale.value), scale.sigma / scale.value, "atlas")
 
-    def take(self, found: Mapping[str, ScaleBelief], fit: TelemetryFit | None, trust: SensorGate) -> None:
+    def take(self, found: Mapping[str, ScaleBelief] | None, fit: TelemetryFit | None, trust: SensorGate) -> None:
         """Update with telemetry.
 
         Args:
-            found: Its beliefs by source; empty where it tells no scale.
+            found: Its beliefs by source; empty where its readings tell no scale, None where none of them moved: then
+                the previous ones stay.
             fit: Details of the fit.
-            trust: Usable readings; beliefs that rest on others are dropped.
+            trust: Usable readings; previous beliefs that rest on others are dropped.
         """
         if fit is not None:
             self.fit = fit
-        before, self._by_telemetry = self._by_telemetry, dict(found)
-        together = mean(list(found.values()))
-        sure = together is not None and min(together.sigma, *(b.sigma for b in found.values())) < _BELIEVED
-        if not sure:  # no new information: hover, pure rotation, or no telemetry
-            trusted = {"telemetry": trust.velocity and trust.tells_scale, "height": any(map(trust.height, HEIGHTS))}
-            # Heights alone are void once the map's vertical has changed.
-            keep = set(before) != {"height"} and all(trusted[source] for source in before)
-            self._by_telemetry = before if keep else {}
+        if found is not None:
+            self._by_telemetry = dict(found)
+            return
+        trusted = {"telemetry": trust.velocity and trust.tells_scale, "height": any(map(trust.height, HEIGHTS))}
+        # Heights alone are void once the map's vertical has changed.
+        if set(self._by_telemetry) == {"height"} or not all(trusted[source] for source in self._by_telemetry):
+            self._by_telemetry = {}
 
     def provisional_scale(self, found: Mapping[str, ScaleBelief]) -> None:
         """Update the guess with heights that are not validated yet."""

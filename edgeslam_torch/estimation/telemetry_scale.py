@@ -161,8 +161,8 @@ class TelemetryScale:
         self._flying = flying
         self._shown = self._compared() if trust.velocity else None
 
-    def beliefs(self) -> tuple[dict[str, ScaleBelief], TelemetryFit | None]:
-        """Scale by velocities (``telemetry``) and by ``height``, each alone, and details of the fit.
+    def beliefs(self) -> tuple[dict[str, ScaleBelief] | None, TelemetryFit | None]:
+        """Scale by velocities (``telemetry``) and by ``height``, each alone, None in hover, and details of the fit.
 
         That of velocities is averaged over both rounding modes, weighted by their posterior probability: sweeps through
         zero, and likelihood of the displacements. Its sigma covers both modes.
@@ -200,7 +200,8 @@ class TelemetryScale:
             rms = moved[max(velocity, key=lambda r: weight[r])].rms_m
         truncates = weight.get(Rounding.TRUNCATE, 0.0)
         shortfall_m_s = 0.5 * config.velocity_step_m_s if truncates > 0.5 else 0.0
-        return found, TelemetryFit(rms, shortfall_m_s, truncates) if found else None
+        fit = TelemetryFit(rms, shortfall_m_s, truncates) if found else None
+        return None if few and not found else found, fit
 
     def _by_velocity(self, rounding: Rounding, moved: Evidence) -> ScaleBelief | None:
         systematic = VELOCITY_TRUNCATED_SCALE_LOG if rounding is Rounding.TRUNCATE else VELOCITY_SCALE_LOG
@@ -253,6 +254,7 @@ class TelemetryScale:
             moved.duration_s,
             moved.sigma,
             VELOCITY_M_S * np.sqrt(0.1 * moved.duration_s),
+            moved.R_to - moved.R_from,
             self._tilt_rad,
             aged,
         )
@@ -298,6 +300,7 @@ class TelemetryScale:
         stamps_s = seen.stamps_s - self._delay_s
         lever = -seen.T[:, :3, :3] @ (self._T_b_c[:3, :3].T @ self._T_b_c[:3, 3])  # from camera to body [m]
         p_w = (seen.T[:, :3, 3] + lever / scale) @ self._R_w_m.T
+        vertical_c = np.einsum("w,nwc->nc", self._R_w_m[2], seen.T[:, :3, :3])
         sigma_map = float(np.median(seen.sigma_t))
         best, best_sigma = None, math.inf
         for name, (times, z) in self._present.track.heights().items():
@@ -309,7 +312,10 @@ class TelemetryScale:
             here &= stamps_s[near] - stamps_s[near - 1] < MAX_GAP_S
             if here.sum() < 2:
                 continue
-            p = np.stack([np.interp(times[here], stamps_s, p_w[:, k]) for k in range(3)], axis=1)
+            p, down = (
+                np.stack([np.interp(times[here], stamps_s, x[:, k]) for k in range(3)], axis=1)
+                for x in (p_w, vertical_c)
+            )
             sigma = HEIGHT_M[name]
             segment = floor_segments(times[here], z[here], scale * p[:, 2], step_m=max(0.08, 4.0 * sigma))
             self._judge_height(Reading(name), p[:, 2:], z[here, None], times[here], segment, scale)
@@ -322,7 +328,9 @@ class TelemetryScale:
             if moved is None:  # nothing else tells how far the scale of other views differs
                 by_views = np.interp(times[here], stamps_s, turned_since(seen.T)) * (_OF_A_VIEW / wander) ** 2
                 aged = by_views if aged is None else aged + by_views
-            evidence = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt, aged, wander)
+            evidence = height_evidence(
+                p, down, z[here], times[here], segment, sigma_map, sigma, scale, tilt, aged, wander
+            )
             if evidence is not None:
                 evidence = evidence.softened(scale * _by_steps(z[here], HEIGHT_STEP_M[name]))
             single = None if evidence is None else evidence.solved(tilt)
@@ -378,7 +386,14 @@ def scale_of(
     sigma_m = VELOCITY_M_S * np.sqrt(0.1 * moved.duration_s)
     tilt = MOUNT_RAD
     evidence = displacement_evidence(
-        moved.moved @ R_w_m.T, reported, moved.from_s, moved.duration_s, moved.sigma, sigma_m, tilt
+        moved.moved @ R_w_m.T,
+        reported,
+        moved.from_s,
+        moved.duration_s,
+        moved.sigma,
+        sigma_m,
+        moved.R_to - moved.R_from,
+        tilt,
     )
     found = None if evidence is None else evidence.belief("telemetry", tilt, 0.0)
     if found is None or found.sigma > _MOST_LOCAL_SIGMA:

@@ -13,6 +13,8 @@ from edgeslam_torch.geometry.rotations import matrix_from_rpy
 
 TILT = math.radians(3.0)
 SCALE = 2.5
+STRAIGHT, DOWN = np.zeros((1000, 3, 3)), np.tile([0.0, 1.0, 0.0], (1000, 1))
+"""A camera that does not turn."""
 
 
 def path(n=80, size_m=0.4):
@@ -32,7 +34,7 @@ def moved(rng, n=80, noise_m=0.0094, noise_map_m=0.0, bias=None, R=None):
 def displaced(t, seen, told, sigma_map_m=1e-4, sigma_m=0.0094):
     n = len(t)
     sigma_map = np.full(n, sigma_map_m / SCALE)
-    return displacement_evidence(seen, told, t, np.full(n, 0.5), sigma_map, np.full(n, sigma_m), TILT)
+    return displacement_evidence(seen, told, t, np.full(n, 0.5), sigma_map, np.full(n, sigma_m), STRAIGHT[:n], TILT)
 
 
 def flown(rng, n=300, noise_m=0.012, tilt=(0.0, 0.0), step=None):
@@ -47,7 +49,7 @@ def flown(rng, n=300, noise_m=0.012, tilt=(0.0, 0.0), step=None):
 
 def heights(t, p, z):
     segment = floor_segments(t, z, SCALE * p[:, 2], 0.08)
-    return height_evidence(p, z, t, segment, 1e-4, 0.015, SCALE, TILT)
+    return height_evidence(p, DOWN[: len(t)], z, t, segment, 1e-4, 0.015, SCALE, TILT)
 
 
 def errors(draw, count):
@@ -104,7 +106,9 @@ def test_a_map_that_drifts_does_not_shrink_the_scale(rng):
         n = len(told)
         sigma_map, sigma_m = np.full(n, 1e-4), np.full(n, 0.0094)
         return [
-            displacement_evidence(np.diff(seen, axis=0) / SCALE, told, t[:-1], np.ones(n), sigma_map, sigma_m, TILT)
+            displacement_evidence(
+                np.diff(seen, axis=0) / SCALE, told, t[:-1], np.ones(n), sigma_map, sigma_m, STRAIGHT[:n], TILT
+            )
         ]
 
     error, ratio = errors(drifting, 40)
@@ -172,7 +176,7 @@ def test_a_noisy_map_does_not_shrink_the_scale_from_height(rng):
         z = 1.0 + SCALE * p[:, 2] + 0.012 * rng.standard_normal(len(z))
         seen = p + 0.05 / SCALE * rng.standard_normal(p.shape)
         segment = np.zeros(len(t), dtype=np.int64)
-        return [height_evidence(seen, z, t, segment, 0.05 / SCALE, 0.015, SCALE, TILT)]
+        return [height_evidence(seen, DOWN[: len(t)], z, t, segment, 0.05 / SCALE, 0.015, SCALE, TILT)]
 
     error, _ = errors(noisy, 40)
     assert abs(np.mean(error)) < 0.03
@@ -209,7 +213,7 @@ def test_the_present_scale_follows_a_map_that_has_drifted_since_the_climb(rng):
     present, throughout = [], []
     for _ in range(12):
         t, seen, told = climbed_then_level(rng, 0.15)
-        given = (seen, told, t, np.full(25, 0.5), np.full(25, 1e-3 / SCALE), np.full(25, 0.0094), TILT)
+        given = (seen, told, t, np.full(25, 0.5), np.full(25, 1e-3 / SCALE), np.full(25, 0.0094), STRAIGHT[:25], TILT)
         for found, aged in ((present, aged_since(t + 0.5, 0.0, 12.5)), (throughout, None)):
             s, sigma = displacement_evidence(*given, aged).solved(TILT)
             found.append((math.log(s / SCALE), sigma))
@@ -226,7 +230,7 @@ def test_the_present_scale_follows_a_map_that_shrinks_all_along(rng):
         step = np.stack([0.3 * np.cos(0.3 * t), 0.3 * np.sin(0.3 * t), 0.02 * np.sin(t)], axis=1)
         seen = step * np.exp(1.2 * (1.0 - t / t[-1]))[:, None] / SCALE
         told = step + 0.0094 * rng.standard_normal(step.shape)
-        given = (seen, told, t, np.full(24, 0.5), np.full(24, 1e-3 / SCALE), np.full(24, 0.0094), TILT)
+        given = (seen, told, t, np.full(24, 0.5), np.full(24, 1e-3 / SCALE), np.full(24, 0.0094), STRAIGHT[:24], TILT)
         evidence = displacement_evidence(*given, aged_since(t + 0.5, 0.0, 12.0))
         off.append((math.log(evidence.solved(TILT)[0] / SCALE), evidence.wander))
         throughout.append(math.log(displacement_evidence(*given).solved(TILT)[0] / SCALE))
@@ -241,7 +245,7 @@ def test_heights_of_an_old_climb_are_less_sure_of_the_present_scale(rng):
     segment = np.zeros(len(t), int)
     sigmas = []
     for until, aged in ((40, True), (120, True), (120, False)):
-        given = (p[:until], z[:until], t[:until], segment[:until], 1e-4, 0.015, SCALE, TILT)
+        given = (p[:until], DOWN[:until], z[:until], t[:until], segment[:until], 1e-4, 0.015, SCALE, TILT)
         s, sigma = height_evidence(*given, aged_since(t[:until], 0.0, t[until - 1]) if aged else None).solved(TILT)
         sigmas.append(sigma)
         assert s == pytest.approx(SCALE * math.exp(0.1), rel=0.03)

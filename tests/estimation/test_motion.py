@@ -416,13 +416,13 @@ def test_small_height_changes_give_no_scale(swinging, replay):
 
 
 @pytest.mark.parametrize(("sources", "held"), [(["height"], False), (["telemetry", "height"], True)])
-@pytest.mark.parametrize("found", [{}, {"height": ScaleBelief(0.1, 0.4, "height")}], ids=["nothing", "unsure"])
-def test_unconfirmed_scale_from_heights_is_withdrawn(sources, held, found):
+@pytest.mark.parametrize("found", [None, {}, {"height": ScaleBelief(0.1, 0.4, "height")}])
+def test_a_scale_is_held_in_hover_unless_it_is_from_heights_alone(sources, held, found):
     trusting = SimpleNamespace(velocity=True, tells_scale=True, height=lambda reading: True)
     metres = ScaleEstimator(FusionConfig(), 0.0)
     metres.take({source: ScaleBelief(0.0, 0.1, source) for source in sources}, TelemetryFit(), trusting)
     metres.take(found, None, trusting)
-    assert (metres.sensor_scale is not None) == held
+    assert (metres.sensor_scale is not None) == (held and found is None)
 
 
 def test_velocities_and_heights_that_disagree_widen_sigma(rng, swinging, replay):

@@ -8,7 +8,8 @@ world. Both kinds of measurement are linear in them:
     h_j = s\,z_j + (s\,\delta \times p_j)_z + c_k + w_j + \epsilon_j
 
 with velocity bias :math:`b` and drift of the visual position :math:`w` that decorrelate in seconds (Ornstein-Uhlenbeck;
-only the drift's change over an interval counts, so that long paths weigh more than oscillations in place).
+only the drift's change over an interval counts, so that long paths weigh more than oscillations in place). Part of
+:math:`w` goes with the camera's rotation, :math:`R_i a` with an unknown :math:`a`, and does not decorrelate.
 """
 
 import math
@@ -23,6 +24,7 @@ from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.noise import (
     MAP_DRIFT_M,
     MAP_DRIFT_MEMORY_S,
+    MAP_PIVOT_M,
     MAP_WANDER_LOG,
     VELOCITY_BIAS_M_S,
     VELOCITY_BIAS_MEMORY_S,
@@ -44,6 +46,9 @@ _MOST_PARTS = 4
 """Maximum number of parts of a flight whose scales are compared; shorter parts are too noisy."""
 _VIEW_RAD = math.radians(60.0)
 """Typical field of view."""
+_NOISE_SHARE_DOUBT = 1.0
+"""Standard deviation of the correction for noise in the regressor, as a share of it: how much of the noise is the map's
+is hardly known. It matters where the path is hardly longer than the noise: hover, rotation in place."""
 _LEAST_AGE_S = 1.0
 """Lower bound of the map's age."""
 _BIN_S = 0.5
@@ -112,6 +117,7 @@ def displacement_evidence(
     duration_s: FloatArray,
     sigma_map: FloatArray,
     sigma_m: FloatArray,
+    turned: FloatArray,
     tilt_sigma_rad: float | FloatArray,
     aged: FloatArray | None = None,
 ) -> Evidence | None:
@@ -127,6 +133,7 @@ def displacement_evidence(
         duration_s: Their lengths ``(N,)``.
         sigma_map: Standard deviation of ``moved_map`` per axis, shape ``(N,)``.
         sigma_m: Expected standard deviation of ``moved_m`` per axis, shape ``(N,)``.
+        turned: Change of the camera's rotation ``R_w_c`` over each interval ``(N, 3, 3)``.
         tilt_sigma_rad: Prior on the rotation; ``(3,)``, about each axis, or one for all.
         aged: Log age of the map since each interval, see `aged_since`, ``(N,)``: estimates the present scale, with less
             weight on older intervals. None: a constant scale.
@@ -143,6 +150,7 @@ def displacement_evidence(
     if not (math.isfinite(s) and s > 1e-9):
         return None
     drifting = _of_changes(lag_s, duration_s, MAP_DRIFT_MEMORY_S)
+    pivoting = MAP_PIVOT_M**2 / 3.0 * np.einsum("iab,jab->ij", turned, turned)  # the mean over the axes
     wandering = 0.0 * bias if aged is None else s**2 * _common(aged) * (moved_map @ moved_map.T)
     J = np.concatenate([moved_map[:, :, None], -hat(moved_map)], axis=2).transpose(1, 0, 2)  # (3, N, 4)
     target = moved_m.T[:, :, None]  # (3, N, 1)
@@ -157,7 +165,7 @@ def displacement_evidence(
         prior = _tilt_prior(s, tilt_sigma_rad)
         likeliest = -math.inf
         for a, c in possible if k == _SELECTED_AT else [chosen]:
-            slow = bias + a**2 * drifting + c**2 * wandering
+            slow = bias + pivoting + a**2 * drifting + c**2 * wandering
             found = _fitted(white, slow, J, latent, target, prior)
             if found is not None and found.log_likelihood > likeliest:
                 fit, chosen, likeliest = found, (a, c), found.log_likelihood
@@ -177,14 +185,16 @@ def displacement_evidence(
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(3.0 * float(weight.sum()), 1e-9))
     torn = float(weight @ np.sum(moved_map**2, axis=1)) < _MIN_EXPLAINED * length
     evidence = Evidence(fit.information, fit.vector, rms, fit.log_likelihood, chosen[1], torn)
-    covariance = (
-        bias + chosen[0] ** 2 * drifting + chosen[1] ** 2 * wandering + np.diag(sigma_m**2 + (s * sigma_map) ** 2)
-    )
-    return evidence.softened(_unrest(covariance, fit, J, latent, target))
+    slow = bias + pivoting + chosen[0] ** 2 * drifting + chosen[1] ** 2 * wandering
+    covariance = slow + np.diag(sigma_m**2 + (s * sigma_map) ** 2)
+    plain = _fitted(white, slow, J, J, target, prior)
+    doubt = 0.0 if plain is None else _NOISE_SHARE_DOUBT * (s - float(plain.theta[_SCALE]))
+    return evidence.softened(math.hypot(doubt, _unrest(covariance, fit, J, latent, target)))
 
 
 def height_evidence(
     p_map: FloatArray,
+    down_c: FloatArray,
     z_m: FloatArray,
     stamp_s: FloatArray,
     segment: IntArray,
@@ -199,6 +209,7 @@ def height_evidence(
 
     Args:
         p_map: Visual positions of the body, world axes (z up) [map units], shape ``(N, 3)``.
+        down_c: The world's vertical in the camera's axes, either sign ``(N, 3)``.
         z_m: Measured height [m], shape ``(N,)``.
         stamp_s: Times ``(N,)``.
         segment: Segment number from `floor_segments`, shape ``(N,)``.
@@ -214,13 +225,13 @@ def height_evidence(
     part = np.unique(np.stack([segment, ((stamp_s - stamp_s[0]) // _BIN_S).astype(int)]), axis=1, return_inverse=True)
     key, group = part[0], part[1].ravel()
     count = np.bincount(group).astype(np.float64)
-    p = np.stack([np.bincount(group, p_map[:, k]) / count for k in range(3)], axis=1)
+    p, down = (np.stack([np.bincount(group, x[:, k]) / count for k in range(3)], axis=1) for x in (p_map, down_c))
     z, t = np.bincount(group, z_m) / count, np.bincount(group, stamp_s) / count
     stretch = np.unique(key[0], return_inverse=True)[1].ravel()
     kept = (np.bincount(stretch) >= _MIN_HEIGHTS)[stretch]
     if not kept.any():
         return None
-    p, z, t, count, stretch = p[kept], z[kept], t[kept], count[kept], stretch[kept]
+    p, down, z, t, count, stretch = p[kept], down[kept], z[kept], t[kept], count[kept], stretch[kept]
     stretch = np.unique(stretch, return_inverse=True)[1].ravel()
     size = np.bincount(stretch)
     p = p - np.stack([np.bincount(stretch, p[:, k]) / size for k in range(3)], axis=1)[stretch]
@@ -234,6 +245,7 @@ def height_evidence(
     if aged is not None:
         risen = np.tril(together) * np.diff(p[:, 2], prepend=p[0, 2])[None]  # sums of these are heights up to offsets
         wandering = (wander * scale) ** 2 * (risen @ _common(np.interp(t, stamp_s, aged)) @ risen.T)
+    wandering = wandering + MAP_PIVOT_M**2 * (down @ down.T)
     prior = _tilt_prior(scale, tilt_sigma_rad, K)
     weight: FloatArray = np.ones(n)
     fit: _Fit | None = None
