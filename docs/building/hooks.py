@@ -35,7 +35,7 @@ BOOSTS = {"index.md": 10.0, "start/": 10.0, "guides/": 10.0, "reference/api/": 1
 }
 """Weights of pages in the search by their beginning; all others have 1. A word in a title weighs a thousand times as
 much as in the text: guides precede names of the API only by such factors."""
-WIDE = ("index.md", "results/")
+WIDE = ("index.md", "results/", "theory/README.md")
 """Beginnings of pages whose tables and outputs take the room of the list of contents."""
 _LINK = re.compile(r"(?<=\]\()([^)#\s:]+)(#[^)\s]*)?(?=\))")
 _FENCED = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)

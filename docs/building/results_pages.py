@@ -263,7 +263,7 @@ def _spread(f: Figures, key: str, text: str = "{:.4f}", factor: float = 1.0, to:
 def _off(f: Figures, key: str) -> str:
     """Error of the scale: the factor that lengths must be multiplied by, minus 1, as ``edgeslam eval`` prints it."""
     errors = {key: [round(100 * (v - 1), 1) + 0.0 for v in f[key]]} if key in f else {}  # + 0.0: no minus before zero
-    return _spread(errors, key, "{:+.1f}", to=" to ", unit=" %")
+    return _spread(errors, key, "{:+.1f}", to="\u00a0to\u00a0", unit="\u00a0%")
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
