@@ -70,9 +70,9 @@ IMU_SCALE_LOG = 0.01
 """Error of the scale by the accelerometer's gain and axes, which averaging does not reduce: a percent beside the laser
 tracker of a real flight; data sheets allow 3 % (MPU-6050)."""
 KNOWN_MOUNT_RAD, KNOWN_LEVER_M, KNOWN_OFFSET_S = 1e-3, 2e-3, 2e-4
-"""Of what a calibration says."""
+"""Of calibrated values."""
 UNKNOWN_MOUNT_RAD, UNKNOWN_LEVER_M, UNKNOWN_OFFSET_S = 0.1, 0.1, 0.02
-"""Of what the model does not say, once rotations have been compared: a camera and an IMU on one small drone."""
+"""Of values that the model leaves out, once rotations have been compared: a camera and an IMU on one small drone."""
 
 # --- clocks -----------------------------------------------------------------------------------------------------------
 
@@ -92,13 +92,13 @@ VISUAL_DRIFT_TURN = 0.003
 VISUAL_JITTER_M, VISUAL_JITTER_RAD = 0.002, 0.001
 """Least noise of a tracked pose."""
 MAP_DRIFT_M, MAP_DRIFT_MEMORY_S = (0.03, 0.002), 4.0
-"""Of the map's local distortion, usual first, of which the residuals choose: the error of a position against those
+"""Of the map's local distortion, default first, of which the residuals choose: the error of a position against those
 seconds before, and its correlation time."""
 MAP_PIVOT_M = 0.02
 """Of the point about which the map takes a rotation to be, per axis: where depths are off, a part of each rotation is
 taken for a translation, the same whenever the rotation recurs. It decides where a camera turns and hardly moves."""
 MAP_WANDER_LOG = (0.03, 0.09, 0.27, 0.81)
-"""Change of the log of the map's scale per e-fold of its age, usual first, of which the residuals choose: 2 to 14 % in
+"""Change of the log of the map's scale per e-fold of its age, default first, of which the residuals choose: 2 to 14 % in
 the first seconds, later 1 to 2 %; with few features the scale may triple."""
 VISUAL_MEMORY_S = 0.5
 """Correlation time of the errors of visual poses: those of a real drone's flight grow with the root of time up to about
@@ -113,6 +113,6 @@ DEPTH_SCALE_LOG = 0.1
 IMPLAUSIBLE_ACCELERATION_M_S2 = 10.0
 """Per axis, 1 g: a prior that is weak against images; hands and drones have 0.2 to 1.7."""
 FAST_M_S = 1e3
-"""Of a velocity that nothing tells, inside a gap of an IMU."""
+"""Of an unmeasured velocity, inside a gap of an IMU's readings."""
 POSITION_FLOOR_M_SQRT_S = 1e-3
 """Minimum process noise of the filter, which keeps the covariance positive definite."""
