@@ -98,8 +98,8 @@ MAP_PIVOT_M = 0.02
 """Of the point about which the map takes a rotation to be, per axis: where depths are off, a part of each rotation is
 taken for a translation, the same whenever the rotation recurs. It decides where a camera turns and hardly moves."""
 MAP_WANDER_LOG = (0.03, 0.09, 0.27, 0.81)
-"""Change of the log of the map's scale per e-fold of its age, default first, of which the residuals choose: 2 to 14 % in
-the first seconds, later 1 to 2 %; with few features the scale may triple."""
+"""Change of the log of the map's scale per e-fold of its age, default first, of which the residuals choose: 2 to 14 %
+in the first seconds, later 1 to 2 %; with few features the scale may triple."""
 VISUAL_MEMORY_S = 0.5
 """Correlation time of the errors of visual poses: those of a real drone's flight grow with the root of time up to about
 a second, the time between keyframes, and hardly beyond."""
