@@ -130,6 +130,8 @@ class Scene:
     texel_m: float = 0.004
     surfaces: list[Surface] = field(default_factory=list)
     boxes: list[Box] = field(default_factory=list)
+    unseen: list[Box] = field(default_factory=list)
+    """Glass: solid and not painted."""
     lamps_w: list[FloatArray] = field(default_factory=list)
     ambient: float = 0.5
     """Share of the light that comes from everywhere."""
@@ -216,7 +218,7 @@ class Scene:
             Quad(s.origin_w, s.u_w, s.v_w, Texture(partial(_bake, k, self)), s.name, s.two_sided)
             for k, s in enumerate(self.surfaces)
         ]
-        return World(quads, name, np.stack([self.low_w, self.high_w]), self.boxes)
+        return World(quads, name, np.stack([self.low_w, self.high_w]), self.boxes, unseen=self.unseen)
 
     @cached_property
     def light_maps(self) -> list[FloatArray]:

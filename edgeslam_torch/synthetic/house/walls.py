@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.synthetic.house.pieces import picture_paint
+from edgeslam_torch.synthetic.house.pieces import build
 from edgeslam_torch.synthetic.house.scene import Paint, Place, Scene, random_paint
 from edgeslam_torch.types import FloatArray
 
@@ -17,7 +17,6 @@ SIDES = ("south", "east", "north", "west")
 """Of a rectangle: low y, high x, high y, low x."""
 THICK_M = 0.12
 DOOR_HEIGHT_M = 2.05
-FRAME_M = 0.06
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,9 +97,10 @@ def wall(scene: Scene, rng: Rng, ends_w: FloatArray, openings: Sequence[Opening]
         _part(scene, first, (reached, low), (0.0, height), paint)
         if opening.height_m < height:
             _part(scene, first, (low, high), (opening.height_m, height), paint)
-            _frame(scene, first, opening, random_paint(rng, FRAMES))
+            build(scene, first, rng, "frame", at=opening.at_m, wide=opening.width_m, height=opening.height_m)
         if opening.leaf_rad is not None:
-            _leaf(scene, first.at(low, 0.0), opening, picture_paint(rng, "door"))
+            hinge = first.at(low, 0.0).at(0.0, 0.0, yaw_rad=opening.leaf_rad)
+            build(scene, hinge, rng, "leaf", wide=opening.width_m, height=opening.height_m)
         reached = high
     _part(scene, first, (reached, length), (0.0, height), paint)
 
@@ -112,24 +112,3 @@ def _part(scene: Scene, first: Place, x: tuple[float, float], z: tuple[float, fl
         return
     centre = (0.5 * (x[0] + x[1]), 0.0, 0.5 * (z[0] + z[1]))
     scene.box(first, centre, size, paint["f"], "wall", faces="frblu" if z[0] > 0 else "frbl", special=paint)
-
-
-def _frame(scene: Scene, first: Place, opening: Opening, paint: Paint) -> None:
-    """Door frame on both sides of the wall, around the opening."""
-    deep, tall = THICK_M + 0.04, opening.height_m
-    for side in (-1, 1):
-        x = opening.at_m + side * (opening.width_m + FRAME_M) / 2
-        size = (FRAME_M, deep, tall)
-        scene.box(first, (x, 0.0, tall / 2), size, paint, "door frame", faces="frbl", inside=True)
-    lintel = (opening.width_m + 2 * FRAME_M, deep, FRAME_M)
-    at = (opening.at_m, 0.0, tall + FRAME_M / 2)
-    scene.box(first, at, lintel, paint, "door frame", faces="frbltu", inside=True)
-
-
-def _leaf(scene: Scene, hinge: Place, opening: Opening, paint: Paint) -> None:
-    """A door's leaf, turned about its hinge towards the wall's front (+y)."""
-    turned = hinge.at(0.0, 0.0, yaw_rad=opening.leaf_rad or 0.0)
-    size = (opening.width_m - 0.01, 0.04, opening.height_m - 0.01)
-    centre = (opening.width_m / 2, 0.0, opening.height_m / 2)
-    edge, faces = Paint("veneer", 0, paint.tint), {"f": paint, "b": paint}
-    scene.box(turned, centre, size, edge, "door", faces="frblt", special=faces)

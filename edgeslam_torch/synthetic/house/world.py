@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -159,14 +161,17 @@ class World:
         bounds_w: FloatArray | None = None,
         boxes: list[Box] | None = None,
         background: tuple[int, int, int] = (90, 90, 90),
+        unseen: Sequence[Box] = (),
     ) -> None:
-        """Args: ``bounds_w`` ``(2, 3)`` free space, low and high corner; ``boxes`` the solids inside it."""
+        """Args: ``bounds_w`` ``(2, 3)`` free space, low and high corner; ``boxes`` the solids inside it; ``unseen``
+        those that are not painted, such as panes of glass."""
         if not 0 < len(quads) < 2**15:
             raise ValueError(f"a world needs 1 to 32767 quads, got {len(quads)}")
         self.quads = tuple(quads)
         self.name = name
         self.boxes = tuple(boxes or [])
         self.background = background
+        self.unseen = tuple(unseen)
         self.corners_w = np.stack([q.corners_w for q in quads])
         self.normals_w = np.stack([q.normal_w for q in quads])
         self.two_sided = np.array([q.two_sided for q in quads])
@@ -192,6 +197,32 @@ class World:
             under = (st >= 0).all(1) & (st <= 1).all(1) & (quad.origin_w[2] <= p[:, 2])
             height[under] = np.maximum(height[under], quad.origin_w[2])
         return height
+
+    def distance_to_solid(self, p_w: FloatArray) -> FloatArray:
+        """Distance [m] of points ``(N, 3)`` to what a drone can hit, ``(N,)``: walls, solids and painted surfaces, but
+        not the floor, on which drones stand; 0 inside a solid or outside the world."""
+        surfaces, boxes = self._hard
+        low, high = self.bounds_w
+
+        def distance(p: FloatArray) -> FloatArray:
+            nearest = np.minimum(p[:, :2] - low[:2], high[:2] - p[:, :2]).min(1)
+            nearest = np.maximum(np.minimum(nearest, high[2] - p[:, 2]), 0.0)
+            return np.minimum(np.minimum(nearest, boxes.distance(p)), surfaces.distance(p))
+
+        return in_parts(distance, p_w)
+
+    @cached_property
+    def _hard(self) -> tuple[Surfaces, Boxes]:
+        return Surfaces([quad for quad in self.quads if quad.name != "floor"]), Boxes([*self.boxes, *self.unseen])
+
+    def with_quads(self, quads: Sequence[Quad]) -> "World":
+        """The same with more to see; the arrays of its own are kept, which takes a millisecond."""
+        out = copy(self)
+        out.quads = (*self.quads, *quads)
+        out.corners_w = np.concatenate([self.corners_w, [q.corners_w for q in quads]])
+        out.normals_w = np.concatenate([self.normals_w, [q.normal_w for q in quads]])
+        out.two_sided = np.concatenate([self.two_sided, [q.two_sided for q in quads]])
+        return out
 
     def distance_to_surface(self, p_w: FloatArray) -> FloatArray:
         """Distance [m] of points ``(N, 3)`` to the nearest quad, ``(N,)``."""

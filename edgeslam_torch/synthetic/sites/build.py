@@ -19,7 +19,6 @@ from edgeslam_torch.synthetic.sites.obstacles import connected, stand_in_the_way
 from edgeslam_torch.synthetic.sites.people import Walker, walker
 from edgeslam_torch.synthetic.sites.scene_file import Dress, SceneFile, read_scene, scene_path
 from edgeslam_torch.synthetic.sites.site import Site, TrueExit
-from edgeslam_torch.synthetic.sites.solids import Solids
 from edgeslam_torch.types import FloatArray
 
 Rng = np.random.Generator
@@ -61,8 +60,6 @@ class _Layout:
     exits: list[TrueExit] = field(default_factory=list)
     gaps: list[_Wall] = field(default_factory=list)
     """Parts of walls at which nothing may stand: doors, and where there is no wall."""
-    panes: list[Box] = field(default_factory=list)
-    """Glass: solid and not painted."""
     walkers: list[Walker] = field(default_factory=list)
 
 
@@ -96,8 +93,7 @@ def named_site(name: str, seed: int) -> Site:
         TrueExit(T_w_site[:3, :3] @ e.centre_w + T_w_site[:3, 3], T_w_site[:3, :3] @ e.normal_w, e.width_m, e.height_m)
         for e in layout.exits
     )
-    solids = Solids(world, layout.panes)
-    return Site(file.name, seed, world, solids, T_site_w, path[-1], exits, path[:, :2], tuple(layout.walkers))
+    return Site(file.name, seed, world, T_site_w, path[-1], exits, path[:, :2], tuple(layout.walkers))
 
 
 def place(name: str, rng: Rng, **given: float) -> World:
@@ -113,7 +109,7 @@ def _flyable(file: SceneFile, rng: Rng) -> _Layout:
     """The first layout that leaves a way from the start to the goal."""
     for _ in range(_TRIES):
         layout = _laid_out(file, rng, {})
-        if connected(layout.scene, layout.way, layout.panes):
+        if connected(layout.scene, layout.way):
             return layout
     raise ConfigError("nothing leaves a free way of 0.8 m from the start to the goal")
 
@@ -153,7 +149,7 @@ def _laid_out(file: SceneFile, rng: Rng, given: dict[str, float]) -> _Layout:
     for glass in file.glass:
         ends = _ends(value(glass.x), value(glass.y))
         half = np.append(np.maximum(0.5 * np.abs(ends[1] - ends[0]), 0.006), 0.5 * bounds[1][2])
-        layout.panes.append(Box(np.append(ends.mean(0), half[2]), half))
+        scene.unseen.append(Box(np.append(ends.mean(0), half[2]), half))
     ways = []
     for person in file.person:
         value.define(person.values)

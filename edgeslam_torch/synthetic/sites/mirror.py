@@ -1,7 +1,5 @@
 """A wall that is a mirror: what a camera sees in it is the world once more, behind the wall."""
 
-from copy import copy
-
 import numpy as np
 
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
@@ -10,16 +8,6 @@ REFLECTION = "reflection"
 """Name of surfaces that are seen and not there."""
 _ON_WALL_M = 0.03
 """What is nearer to the wall belongs to it: skirting boards."""
-
-
-def with_quads(world: World, quads: list[Quad]) -> World:
-    """The world with more surfaces; the arrays of its own are kept, which takes a millisecond."""
-    out = copy(world)
-    out.quads = (*world.quads, *quads)
-    out.corners_w = np.concatenate([world.corners_w, [q.corners_w for q in quads]])
-    out.normals_w = np.concatenate([world.normals_w, [q.normal_w for q in quads]])
-    out.two_sided = np.concatenate([world.two_sided, [q.two_sided for q in quads]])
-    return out
 
 
 def mirrored(world: World) -> World:
@@ -31,7 +19,7 @@ def mirrored(world: World) -> World:
     wall = float(world.bounds_w[1, 0])
     kept = [q for q in world.quads if (q.corners_w[:, 0] < wall - _ON_WALL_M).any()]
     behind = [_reflected(q, wall) for q in kept]
-    return World([*kept, *behind], world.name, world.bounds_w, list(world.boxes), world.background)
+    return World([*kept, *behind], world.name, world.bounds_w, list(world.boxes), world.background, world.unseen)
 
 
 def _reflected(quad: Quad, wall: float) -> Quad:

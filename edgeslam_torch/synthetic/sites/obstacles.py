@@ -7,7 +7,6 @@ from scipy import ndimage
 
 from edgeslam_torch.synthetic.house.pieces import build
 from edgeslam_torch.synthetic.house.scene import Place, Scene
-from edgeslam_torch.synthetic.house.world import Box
 
 Rng = np.random.Generator
 KINDS = ("column", "hanging_lamp", "table_and_chair", "pile", "lamp")
@@ -39,25 +38,23 @@ def stand_in_the_way(
             del scene.surfaces[before[0] :], scene.boxes[before[1] :]
 
 
-def connected(scene: Scene, places: Sequence[Sequence[float]], unseen: Sequence[Box] = ()) -> bool:
+def connected(scene: Scene, places: Sequence[Sequence[float]]) -> bool:
     """Whether one can go between places of the floor at heights of flight, `PASSAGE_M` from every solid, and down to
     the floor at the first of them.
 
     Args:
         scene: The solids.
         places: x and y of each [m].
-        unseen: Solids that are not painted.
     """
-    boxes = [*scene.boxes, *unseen]
-    parts, _ = ndimage.label(_free(scene, boxes))
+    parts, _ = ndimage.label(_free(scene))
     cells = [tuple(np.floor((np.array(p) - scene.low_w[:2]) / _GRID_M).astype(int)) for p in places]
     column = np.array([[*places[0], z] for z in np.arange(0.0, 1.0, 0.1)])
-    stands = all((box.distance(column) > PASSAGE_M).all() for box in boxes)
+    stands = all((box.distance(column) > PASSAGE_M).all() for box in (*scene.boxes, *scene.unseen))
     found = {int(parts[cell]) for cell in cells}
     return stands and len(found) == 1 and 0 not in found
 
 
-def _free(scene: Scene, boxes: Sequence[Box]) -> np.ndarray:
+def _free(scene: Scene) -> np.ndarray:
     """Cells of the floor above which a drone can fly, ``(X, Y)`` bool."""
     low, high = scene.low_w[:2], scene.high_w[:2]
     count = np.ceil((high - low) / _GRID_M).astype(int)
@@ -66,6 +63,6 @@ def _free(scene: Scene, boxes: Sequence[Box]) -> np.ndarray:
     free = np.minimum(grid - low, high - grid).min(-1) > PASSAGE_M
     for z in (0.8, 1.1, 1.4):
         p = np.concatenate([grid, np.full((*grid.shape[:2], 1), z)], axis=-1)
-        for box in boxes:
+        for box in (*scene.boxes, *scene.unseen):
             free &= box.distance(p) > PASSAGE_M
     return free

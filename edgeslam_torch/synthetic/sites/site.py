@@ -5,9 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.synthetic.house.world import World
-from edgeslam_torch.synthetic.sites.mirror import with_quads
 from edgeslam_torch.synthetic.sites.people import Walker
-from edgeslam_torch.synthetic.sites.solids import Solids
 from edgeslam_torch.types import FloatArray
 
 
@@ -30,8 +28,6 @@ class Site:
     name: str
     seed: int
     world: World
-    solids: Solids
-    """Everything that a drone can hit, also what no camera sees."""
     T_site_w: FloatArray
     """``(4, 4)`` the drone's own world (origin on the floor below it, x forward) in the site's axes."""
     goal_w: FloatArray
@@ -41,7 +37,7 @@ class Site:
     pathway_w: FloatArray
     """``(N, 2)`` a polyline from the start to the goal through free space, in the drone's own world [m]."""
     walkers: tuple[Walker, ...] = ()
-    """People, who are neither in `world` nor in `solids`."""
+    """People, who are not in `world`."""
 
     def clearance(self, p_w: FloatArray, clock_s: float | None = None) -> FloatArray:
         """Distance [m] from points ``(N, 3)`` of the drone's own world to the nearest solid.
@@ -51,7 +47,7 @@ class Site:
             clock_s: When, for sites in which people walk; without it, to what does not move.
         """
         p = self.in_site(p_w)
-        away = self.solids.distance(p)
+        away = self.world.distance_to_solid(p)
         if clock_s is not None:
             for walker in self.walkers:
                 away = np.minimum(away, walker.distance(p, clock_s))
@@ -60,7 +56,7 @@ class Site:
     def painted(self, clock_s: float) -> World:
         """What a camera sees at a time."""
         people = [quad for walker in self.walkers for quad in walker.painted(clock_s)]
-        return with_quads(self.world, people) if people else self.world
+        return self.world.with_quads(people) if people else self.world
 
     def in_site(self, p_w: FloatArray) -> FloatArray:
         """Points ``(..., 3)`` of the drone's own world in the site's axes."""

@@ -31,7 +31,7 @@ def flat(tmp_path):
 
 def free_at(site, p):
     """Distance [m] of a point in the scene's axes to the nearest solid."""
-    return float(site.solids.distance(np.array([p], float))[0])
+    return float(site.world.distance_to_solid(np.array([p], float))[0])
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_what_a_camera_sees_can_be_hit(name):
         v, u = np.mgrid[2:60:9, 2:80:9]
         rays = CAMERA.back_project(np.stack([u.ravel(), v.ravel()], 1), depth[v, u].ravel().astype(float))
         hits = rays @ T_w_c[:3, :3].T + T_w_c[:3, 3]
-        assert site.solids.distance(hits[hits[:, 2] > 0.05]).max() < 0.01
+        assert site.world.distance_to_solid(hits[hits[:, 2] > 0.05]).max() < 0.01
 
 
 @pytest.mark.parametrize("seed", [0, 2])

@@ -29,4 +29,4 @@ def test_a_mirror_is_hit_and_what_it_shows_is_not():
     site = named_site("mirror", 0)
     wall = float(site.world.bounds_w[1, 0])
     line = np.array([[wall - away, 0.0, 1.3] for away in (1.0, 0.5, 0.0)])
-    np.testing.assert_allclose(site.solids.distance(line), [1.0, 0.5, 0.0], atol=0.02)
+    np.testing.assert_allclose(site.world.distance_to_solid(line), [1.0, 0.5, 0.0], atol=0.02)
