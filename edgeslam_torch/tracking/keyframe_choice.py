@@ -16,13 +16,13 @@ from edgeslam_torch.types import FloatArray, IntArray
 SHORTEST_GAP_S = 0.04
 """Minimum time between keyframes whatever the change of view: every second frame at 30 Hz, every frame at 20."""
 FOLLOWED = 0.9
-"""Share of the last keyframe's keypoints below which flow asks for a keyframe: a rotation by 6 degrees loses a tenth of
+"""Share of the last keyframe's keypoints below which flow requests a keyframe: a rotation by 6 degrees loses a tenth of
 a 60-degree view."""
 AT_ONCE = 0.75
 """Below this share, the minimum time between keyframes is ignored: after a rotation by 15 degrees since the last
 keyframe, at 100 degrees a second, half the view would be lost meanwhile."""
 OVERLAP = 0.7
-"""Share of the reference keyframe's anchors below which matching asks for a keyframe."""
+"""Share of the reference keyframe's anchors below which matching requests a keyframe."""
 
 OLD_S = 10.0
 """Age from which on a keyframe belongs to an earlier visit; more recent ones, of a shaking hand or a rotation in place,

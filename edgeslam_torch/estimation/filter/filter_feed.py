@@ -45,7 +45,7 @@ class FilterView:
     seen: VisualPose
     """The last visual pose of the camera."""
     to_s: float
-    """Stamp of the estimate, on the clock of the one that was asked for."""
+    """Stamp of the estimate, on the clock of the requested one."""
     T_seen_c: FloatArray
     """``(4, 4)`` camera, relative to the camera at `seen` [m]."""
     velocity_m_s: FloatArray

@@ -157,7 +157,7 @@ def align(
     metric_steps = _METRIC_STEPS if before is None else 0
     for step in range(_STEPS):
         metric = step < metric_steps
-        apart = np.concatenate(
+        deviation = np.concatenate(
             [
                 Rotation.from_matrix(mount[0].T @ x.R_i_c).as_rotvec(),
                 x.t_i_c - lever,
@@ -166,7 +166,7 @@ def align(
         )
         system = _linearised(x, R_m_c, z, pre, whiten, walk, rate, offset_s, metric)
         try:
-            by_node, by_all, covariance = _solved(*system, x.bias[0], apart, sigma_known)
+            by_node, by_all, covariance = _solved(*system, x.bias[0], deviation, sigma_known)
         except (LinAlgError, ValueError):
             return None
         x = _moved(x, by_node, by_all, metric)
@@ -202,8 +202,8 @@ def _initial(
     else:
         R_i_c, offset_s, lever = start
         log_scale, sigma, R = 0.0, (_START_RAD, _START_SHARE * extent), R_m_c @ R_i_c.T
-        apart = Rotation.from_matrix(_T(pre.R) @ _T(R[:-1]) @ R[1:]).as_rotvec()
-        bias[:, :3] += np.linalg.lstsq(pre.by_bias[:, :3, :3].reshape(-1, 3), apart.ravel(), rcond=None)[0]
+        deviation = Rotation.from_matrix(_T(pre.R) @ _T(R[:-1]) @ R[1:]).as_rotvec()
+        bias[:, :3] += np.linalg.lstsq(pre.by_bias[:, :3, :3].reshape(-1, 3), deviation.ravel(), rcond=None)[0]
         up = np.einsum("kij,kj->i", R[:-1], pre.v)
         gravity = -GRAVITY_M_S2 * up / np.linalg.norm(up)
     p = math.exp(log_scale) * z - R @ lever
@@ -305,7 +305,7 @@ def _solved(
     J_first: FloatArray,
     r_first: FloatArray,
     bias: FloatArray,
-    apart: FloatArray,
+    deviation: FloatArray,
     sigma_known: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Gauss-Newton step of nodes ``(N, 15)`` and of what is common ``(10,)``, with the latter's covariance."""
@@ -329,7 +329,7 @@ def _solved(
     slope[0, 9:] += IMU_BIAS_SIGMA**-2 * bias
     known = np.arange(3, _COMMON)
     corner[known, known] += sigma_known**-2
-    common[known] += sigma_known**-2 * apart
+    common[known] += sigma_known**-2 * deviation
     band = np.zeros((2 * n, n * N))
     i, j = np.tril_indices(n)
     band[(i - j)[None], n * np.arange(N)[:, None] + j] = own[:, i, j]

@@ -209,8 +209,8 @@ class TelemetryTrack:
     def battery(self) -> float:
         """Newest charge in [0, 1]; NaN if the last messages have none."""
         lately = self._rows["battery"][-_RECENT:]
-        told = lately[np.isfinite(lately)]
-        return float(told[-1]) if len(told) else math.nan
+        finite = lately[np.isfinite(lately)]
+        return float(finite[-1]) if len(finite) else math.nan
 
     @property
     def readings(self) -> Readings:
