@@ -67,10 +67,16 @@ def run_ablation(
     wanted |= {ROWS[name].against for name in wanted} | {DEFAULT}
     rows = {name: (row.set, row.first) for name, row in ROWS.items() if name in wanted}
     found = run_rows(settings, sequences(settings), rows, out, say)
-    kept = {name: {"runs": found.get(name, [])} for name in ROWS}
+    kept = {name: {"runs": [_kept(run) for run in found.get(name, [])]} for name in ROWS}
     record = conditions() | {"settings": asked(settings), "rows": kept}
     write_text(out / "ablation.json", json.dumps(record, indent=1) + "\n")
     return record
+
+
+def _kept(run: dict[str, Any]) -> dict[str, Any]:
+    """What the record has of a run."""
+    figures = {column.name: run["figures"].get(column.name) for column in COLUMNS}
+    return {"sequence": run["sequence"], "seed": run["seed"], "figures": figures, "error": run["error"]}
 
 
 def markdown_ablation(record: dict[str, Any]) -> str:
