@@ -1,9 +1,12 @@
 """Plain loops compiled by numba: single-threaded, with a fixed order of summation, so that results are reproducible.
 
 A compiled function calls compiled functions of its own file only: numba's cache notices changes of that file alone.
+It multiplies no matrices by ``@``: numba would import SciPy for it, a fifth of the memory and time of a start.
 """
 
+import importlib
 import logging
+import sys
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -48,6 +51,15 @@ def compile_all() -> None:
         loops.compile(types)
 
 
+def _load_without_blas() -> None:
+    """Load the part of numba that imports SciPy for its BLAS if there is one, and otherwise does without."""
+    blas = "scipy.linalg.cython_blas"
+    if blas not in sys.modules:
+        sys.modules[blas] = None  # type: ignore[assignment]
+        importlib.import_module("numba.np.arraymath")
+        del sys.modules[blas]
+
+
 class _Notice(event.Listener):
     """Logs once that the first call compiles, which takes long."""
 
@@ -63,3 +75,4 @@ class _Notice(event.Listener):
 
 
 event.register("numba:compile", _Notice())
+_load_without_blas()

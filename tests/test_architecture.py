@@ -198,9 +198,9 @@ def test_packages_that_do_not_belong_are_not_imported():
     assert {name: users[name] for name in LINKED if users[name]} == {}, "import edgeslam_torch.losses, not losses"
 
 
-def loaded_by(statement):
+def loaded_by(statement, names=HEAVY):
     """Heavy packages that a fresh interpreter has after a statement."""
-    code = f"import sys; {statement}; print(' '.join(m for m in {HEAVY!r} if m in sys.modules))"
+    code = f"import sys; {statement}; print(' '.join(m for m in {names!r} if m in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     return set(done.stdout.split())
 
@@ -212,8 +212,10 @@ def test_nothing_heavy_is_imported_at_first(statement):
     assert loaded_by(statement) == set()
 
 
-def test_slam_and_runs_load_no_torch():
-    assert "torch" not in loaded_by("import edgeslam_torch.run, edgeslam_torch.slam")
+def test_slam_and_runs_load_neither_torch_nor_scipy():
+    parts = [f"scipy.{part}" for part in ("linalg", "ndimage", "sparse", "spatial", "special")]  # numba loads scipy
+    names = ["torch", "onnx", "matplotlib", *parts]
+    assert loaded_by("import edgeslam_torch.run, edgeslam_torch.slam", names) == set()
 
 
 def test_commands_that_only_list_their_options_load_no_torch():

@@ -6,13 +6,12 @@ by sensors compare the scale of both places. Images add the links that merge sub
 they are believed if they agree with `SubmapGraph.between`.
 """
 
+import heapq
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
 from edgeslam_torch import gate
 from edgeslam_torch.atlas.saved import BEFORE_S
@@ -204,13 +203,11 @@ class SubmapGraph:
         centre = np.stack([k.centre_w for k in members])
         i, j = np.array(list(shared_anchors(self.map, members)), dtype=np.int64).reshape(-1, 2).T
         edge = np.linalg.norm(centre[i] - centre[j], axis=1) * share[i] + _MIN_DISTANCE
-        ways = csr_array((edge, (i, j)), shape=(len(members), len(members)))
-        here, at = row_of[one.id], row_of[other.id]
-        drift, before = dijkstra(ways, directed=False, indices=here, return_predecessors=True)
-        sigma, steps = float(drift[at]), 1
-        while at != here:
-            steps, at = steps + min(abs(at - int(before[at])), NEIGHBOURS), int(before[at])
-        return sigma, steps
+        ways: dict[int, list[tuple[int, float]]] = {row: [] for row in range(len(members))}
+        for a, b, length in zip(i.tolist(), j.tolist(), edge.tolist(), strict=True):
+            ways[a].append((b, length))
+            ways[b].append((a, length))
+        return _least_drift(ways, row_of[one.id], row_of[other.id])
 
     # -- scale -------------------------------------------------------------------------------------------------
 
@@ -251,6 +248,20 @@ def _is_other(ratio: float, sigma_log: float) -> bool:
 def _ratio(here: ScaleEstimate, there: ScaleEstimate) -> tuple[float, float]:
     """Ratio of two scales, and the standard deviation of its logarithm."""
     return here.value / there.value, math.hypot(here.sigma / here.value, there.sigma / there.value)
+
+
+def _least_drift(ways: dict[int, list[tuple[int, float]]], here: int, there: int) -> tuple[float, int]:
+    """Length and steps of the shortest way between two nodes of a connected graph (Dijkstra)."""
+    done: set[int] = set()
+    reached = [(0.0, 1, here)]
+    while reached[0][2] != there:
+        drift, steps, at = heapq.heappop(reached)
+        if at in done:
+            continue
+        done.add(at)
+        for other, length in ways[at]:
+            heapq.heappush(reached, (drift + length, steps + min(abs(at - other), NEIGHBOURS), other))
+    return reached[0][:2]
 
 
 def shared_anchors(slam_map: SlamMap, members: list[Keyframe]) -> dict[tuple[int, int], int]:

@@ -17,7 +17,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.sensors.attitude import Headings, UpDirections, headings, up_directions
@@ -140,16 +139,14 @@ class TelemetryModel:
         slow = rows.slow + rows.common @ rows.common.T
         weight = np.ones(len(residual))
         for _ in range(3):
-            factor = cho_factor(slow + np.diag(rows.white / weight), lower=True)
-            clean = residual - slow @ cho_solve(factor, residual)
+            clean = residual - slow @ np.linalg.solve(slow + np.diag(rows.white / weight), residual)
             allowed = rows.white + np.square(_BENT * np.minimum(rows.way, np.median(rows.way)))
             power = np.bincount(rows.group, clean**2 / allowed)
             z = np.sqrt(power)
             spread = max(1.0, float(np.median(z)))
             tukey = tukey_weight(z, spread)
             weight = np.maximum(tukey, _LEAST_WEIGHT)[rows.group]
-        factor = cho_factor(slow + np.diag(rows.white / weight), lower=True)
-        whitened = cho_solve(factor, np.column_stack([D, rows.measured]))
+        whitened = np.linalg.solve(slow + np.diag(rows.white / weight), np.column_stack([D, rows.measured]))
         A = D.T @ whitened[:, :-1]
         refused = int(np.count_nonzero(tukey <= _LEAST_WEIGHT))
         return PositionGaussian(

@@ -9,9 +9,9 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import matrix_from_rpy, smallest_rotation
 from edgeslam_torch.types import FloatArray, PointCloud, ScaleEstimate
 
 T_LEVEL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -107,8 +107,7 @@ class OutputFrame:
 
     def levelled(self, up_map: FloatArray, centre_map: FloatArray) -> "OutputFrame":
         """The same with a direction ``(3,)`` of the map up, by the smallest rotation; ``centre_map`` as above."""
-        turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [self.R @ up_map])
-        R = turn.as_matrix() @ self.R
+        R = smallest_rotation(self.R @ up_map, np.array([0.0, 0.0, 1.0])) @ self.R
         return replace(self, R=R, offset=self.offset + self.scale * ((self.R - R) @ centre_map))
 
     def _rescaled(self, scale: float, centre_map: FloatArray) -> "OutputFrame":
@@ -145,5 +144,5 @@ def first_pose(rpy_rad: FloatArray, T_b_c: FloatArray) -> FloatArray:
     if not np.isfinite(rpy_rad).all():
         return T_LEVEL.copy()
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("ZYX", rpy_rad[::-1]).as_matrix() @ T_b_c[:3, :3]
+    T[:3, :3] = matrix_from_rpy(rpy_rad) @ T_b_c[:3, :3]
     return se3.orthonormalised(T)

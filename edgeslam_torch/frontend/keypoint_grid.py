@@ -51,6 +51,33 @@ class KeypointGrid:
         return _near(query_uv, radius_px, self._u, self._v, self._order, self._start, self._origin, self._columns)
 
 
+def nearest_pixels(uv: FloatArray, query_uv: FloatArray, count: int) -> tuple[FloatArray, IntArray]:
+    """Distances [px] and indices, ``(M, count)`` each, of the ``count`` pixels of ``(N, 2)`` nearest to ``(M, 2)``.
+
+    Example:
+        >>> nearest_pixels(np.array([[0.0, 0.0], [9.0, 0.0]]), np.array([[8.0, 0.0]]), 1)
+        (array([[1.]]), array([[1]]))
+    """
+    return _nearest(np.asarray(uv, np.float64), np.asarray(query_uv, np.float64), count)
+
+
+@compiled("f8[:,::1], f8[:,::1], i8")
+def _nearest(uv: FloatArray, query_uv: FloatArray, count: int) -> tuple[FloatArray, IntArray]:
+    squared, index = np.full((len(query_uv), count), np.inf), np.zeros((len(query_uv), count), np.int64)
+    for q in range(len(query_uv)):
+        best, which = squared[q], index[q]
+        x, y = query_uv[q]
+        for k in range(len(uv)):
+            away = (uv[k, 0] - x) ** 2 + (uv[k, 1] - y) ** 2
+            if away < best[-1]:
+                at = count - 1
+                while at > 0 and away < best[at - 1]:
+                    best[at], which[at] = best[at - 1], which[at - 1]
+                    at -= 1
+                best[at], which[at] = away, k
+    return np.sqrt(squared), index
+
+
 @compiled("f8[:,::1], f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], f8[::1], i8")
 def _near(
     query_uv: FloatArray,

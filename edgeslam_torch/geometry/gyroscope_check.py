@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from edgeslam_torch.geometry.rotations import fitted_rotation, vectors_from_matrices
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.types import FloatArray
 
@@ -98,7 +98,7 @@ def _increments(
     angle = np.column_stack([np.interp(t, t_imu, column) for column in turned.T])
     near = np.diff(t) < 2.0 * _STEP_S
     relative = np.swapaxes(R[:-1], 1, 2) @ R[1:]
-    return np.diff(angle, axis=0)[near], Rotation.from_matrix(relative).as_rotvec()[near], np.diff(t)[near]
+    return np.diff(angle, axis=0)[near], vectors_from_matrices(relative)[near], np.diff(t)[near]
 
 
 def _misfit(gyroscope: FloatArray, camera: FloatArray, dt: FloatArray) -> float:
@@ -111,5 +111,4 @@ def _misfit(gyroscope: FloatArray, camera: FloatArray, dt: FloatArray) -> float:
 
 def _fitted(gyroscope: FloatArray, camera: FloatArray) -> FloatArray:
     """Rotation from camera to IMU axes that fits best (Wahba)."""
-    U, _, Vt = np.linalg.svd((gyroscope - gyroscope.mean(axis=0)).T @ (camera - camera.mean(axis=0)))  # without bias
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+    return fitted_rotation(camera - camera.mean(axis=0), gyroscope - gyroscope.mean(axis=0))  # without bias

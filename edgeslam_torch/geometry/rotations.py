@@ -1,10 +1,11 @@
-"""Roll, pitch, yaw and rotation vectors in scalar code: the filter processes single poses, where numpy is slow."""
+"""Rotations: roll, pitch, yaw, rotation vectors and fits; in scalar code for single ones, where numpy is slow."""
 
 import math
 from collections.abc import Sequence
 
 import numpy as np
 
+from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray
 
 
@@ -67,6 +68,56 @@ def rotation_vector_of(rows: Sequence[Sequence[float]]) -> tuple[float, float, f
     angle = math.atan2(sine, 0.5 * (r00 + r11 + r22 - 1.0))
     scale = 0.5 if sine < 1e-9 else 0.5 * angle / sine
     return scale * x, scale * y, scale * z
+
+
+def matrices_from_vectors(phi: FloatArray) -> FloatArray:
+    """Rotations ``(..., 3, 3)`` of rotation vectors ``(..., 3)`` [rad] (Rodrigues)."""
+    half = np.linalg.norm(phi, axis=-1)[..., None, None] / (2.0 * np.pi)  # in the unit of `numpy.sinc`
+    across = hat(phi)
+    return np.eye(3) + np.sinc(2.0 * half) * across + 0.5 * np.sinc(half) ** 2 * (across @ across)
+
+
+def vectors_from_matrices(R: FloatArray) -> FloatArray:
+    """Rotation vectors ``(..., 3)`` [rad] of rotations ``(..., 3, 3)``, accurate for angles up to pi."""
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(R.reshape(-1, 3, 3), 0, -1)
+    # Rows are the quaternion (w, x, y, z) times four of its components; the longest one is accurate (Shepperd 1978).
+    rows = np.array(
+        [
+            [1.0 + a + e + i, h - f, c - g, d - b],
+            [h - f, 1.0 + a - e - i, b + d, c + g],
+            [c - g, b + d, 1.0 - a + e - i, f + h],
+            [d - b, c + g, f + h, 1.0 - a - e + i],
+        ]
+    )
+    w, *xyz = rows[np.einsum("iin->in", rows).argmax(axis=0), :, np.arange(len(a))].T
+    vector = np.copysign(1.0, w) * np.array(xyz)
+    sine = np.linalg.norm(vector, axis=0)
+    small = sine < 1e-9 * np.abs(w)
+    angle = 2.0 * np.arctan2(sine, np.abs(w))
+    scale = np.where(small, 2.0 / np.where(small, np.abs(w), 1.0), angle / np.where(small, 1.0, sine))
+    return np.asarray((scale * vector).T.reshape(R.shape[:-1]))
+
+
+def rotated(R: FloatArray, p: FloatArray) -> FloatArray:
+    """Vectors ``(N, 3)``, each by its own rotation ``(N, 3, 3)``."""
+    return np.einsum("kij,kj->ki", R, p)
+
+
+def smallest_rotation(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The rotation ``(3, 3)`` by the smallest angle that takes the direction ``a`` to the direction ``b``."""
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    half = a + b
+    if half @ half < 1e-18:  # opposite: half a turn about any axis across
+        axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        return np.asarray(2.0 * np.outer(axis, axis) / (axis @ axis) - np.eye(3))
+    # Half a turn about `a`, then half a turn about the middle between both.
+    return np.asarray((2.0 * np.outer(half, half) / (half @ half) - np.eye(3)) @ (2.0 * np.outer(a, a) - np.eye(3)))
+
+
+def fitted_rotation(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The rotation ``(3, 3)`` that takes vectors ``a`` to ``b``, ``(N, 3)`` each, with the least error (Wahba)."""
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def wrapped(angle: FloatArray) -> FloatArray:

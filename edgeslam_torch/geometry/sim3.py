@@ -6,8 +6,8 @@ inverses are those of matrices.
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from edgeslam_torch.geometry.rotations import matrices_from_vectors, vectors_from_matrices
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray
 
@@ -63,8 +63,7 @@ def exp(xi: FloatArray) -> FloatArray:
     """
     rho, phi, sigma = xi[..., :3], xi[..., 3:6], xi[..., 6]
     S = np.zeros((*xi.shape[:-1], 4, 4))
-    R = Rotation.from_rotvec(phi.reshape(-1, 3)).as_matrix().reshape(*phi.shape, 3)
-    S[..., :3, :3] = np.exp(sigma)[..., None, None] * R
+    S[..., :3, :3] = np.exp(sigma)[..., None, None] * matrices_from_vectors(phi)
     S[..., :3, 3] = (_left(phi, sigma) @ rho[..., None])[..., 0]
     S[..., 3, 3] = 1.0
     return S
@@ -73,8 +72,7 @@ def exp(xi: FloatArray) -> FloatArray:
 def log(S: FloatArray) -> FloatArray:
     """Tangents ``(..., 7)`` of similarities; inverse of `exp` for angles below pi."""
     scale = np.cbrt(np.linalg.det(S[..., :3, :3]))
-    R = S[..., :3, :3] / scale[..., None, None]
-    phi, sigma = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1]), np.log(scale)
+    phi, sigma = vectors_from_matrices(S[..., :3, :3] / scale[..., None, None]), np.log(scale)
     rho = np.linalg.solve(_left(phi, sigma), S[..., :3, 3:])[..., 0]
     return np.concatenate([rho, phi, sigma[..., None]], axis=-1)
 

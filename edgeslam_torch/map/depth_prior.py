@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from edgeslam_torch.frontend.keypoint_grid import nearest_pixels
 from edgeslam_torch.geometry.robust_statistics import robust_sigma
 from edgeslam_torch.map.anchors import Anchors
 from edgeslam_torch.map.keyframe import Keyframe
@@ -92,7 +92,7 @@ def depth_prior(keyframe: Keyframe, uv: FloatArray, anchors: Anchors) -> tuple[F
             bend, unexplained = _bend(anchor_uv[known], error[known], uv)
             log_ratio = fit.log_ratio_at(network)
             return network * np.exp(log_ratio + bend), np.hypot(np.maximum(sigma, unexplained), 0.05)
-    log_z, _ = _nearby(cKDTree(anchor_uv), np.log(z), uv)
+    log_z, _ = _nearby(anchor_uv, np.log(z), uv)
     return np.exp(log_z), np.full(len(uv), UNKNOWN_DEPTH_LOG)
 
 
@@ -103,19 +103,17 @@ def _bend(anchor_uv: FloatArray, error: FloatArray, uv: FloatArray) -> tuple[Flo
         The correction ``(N,)``, fading with the distance to the nearest anchor, and the robust spread of the anchors'
         leave-one-out residuals.
     """
-    tree = cKDTree(anchor_uv)
-    mean, distance = _nearby(tree, error, uv)
-    mean_of_others, to_others = _nearby(tree, error, anchor_uv, but_itself=True)
+    mean, distance = _nearby(anchor_uv, error, uv)
+    mean_of_others, to_others = _nearby(anchor_uv, error, anchor_uv, but_itself=True)
     left = error - np.exp(-to_others / REACH_PX) * mean_of_others
     return np.exp(-distance / REACH_PX) * mean, robust_sigma(left)
 
 
 def _nearby(
-    tree: cKDTree, values: FloatArray, uv: FloatArray, but_itself: bool = False
+    anchor_uv: FloatArray, values: FloatArray, uv: FloatArray, but_itself: bool = False
 ) -> tuple[FloatArray, FloatArray]:
     """Distance-weighted mean of the values at the four nearest anchors, and the distance [px] to the nearest."""
-    k = min(NEAREST + but_itself, tree.n)
-    distance, nearest = (side.reshape(len(uv), k) for side in tree.query(uv, k=k))
+    distance, nearest = nearest_pixels(anchor_uv, uv, min(NEAREST + but_itself, len(anchor_uv)))
     if but_itself:
         distance, nearest = distance[:, 1:], nearest[:, 1:]
     weight = 1.0 / (distance + 5.0)

@@ -1,11 +1,10 @@
 """Detection of revisits: the camera is back at a place of an earlier part of the map."""
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
+from edgeslam_torch.compiled import compiled
 from edgeslam_torch.map.keyframe import Keyframe
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 MIN_SHARED = 15
 """Anchors in common from which on two keyframes are covisible, as in `SlamMap.covisible`."""
@@ -37,9 +36,28 @@ def is_back(earlier: list[Keyframe], recent: list[Keyframe], reach: FloatArray) 
     return bool((covisible & known)[len(earlier) :].any())
 
 
-def _shared(members: list[Keyframe], earlier: int) -> NDArray[np.int32]:
+def _shared(members: list[Keyframe], earlier: int) -> IntArray:
     """Number of common anchors of keyframes with each of the first ones of them, ``(K, E)``."""
     observed = [k.anchor[k.anchor >= 0] for k in members]
-    row = np.repeat(np.arange(len(members)), [len(h) for h in observed])
-    sees = csr_array((np.ones(len(row), np.int32), (row, np.concatenate(observed))))
-    return np.asarray((sees @ sees[:earlier].T).toarray())
+    first = np.cumsum([0, *(len(anchor) for anchor in observed)])
+    return _counted(np.concatenate(observed), first, earlier)
+
+
+@compiled("i8[::1], i8[::1], i8")
+def _counted(anchor: IntArray, first: IntArray, earlier: int) -> IntArray:
+    """Common anchors ``(K, E)`` of keyframes whose anchors follow each other, from ``first`` ``(K + 1,)`` on."""
+    seen = np.zeros(anchor.max() + 2 if len(anchor) else 1, np.int64)  # where the keyframes that see an anchor begin
+    for k in range(first[earlier]):
+        seen[anchor[k] + 1] += 1
+    seen = np.cumsum(seen)
+    keyframe, end = np.empty(first[earlier], np.int64), seen.copy()
+    for row in range(earlier):
+        for k in range(first[row], first[row + 1]):
+            keyframe[end[anchor[k]]] = row
+            end[anchor[k]] += 1
+    shared = np.zeros((len(first) - 1, earlier), np.int64)
+    for row in range(len(first) - 1):
+        for k in range(first[row], first[row + 1]):
+            for m in range(seen[anchor[k]], seen[anchor[k] + 1]):
+                shared[row, keyframe[m]] += 1
+    return shared

@@ -120,7 +120,7 @@ class WindowEdges:
         corners = self.config.uses_corners and uv is not None
         mask = canny(grey, *edge_thresholds(grey, config.canny_low, config.canny_high)) if corners else None
         unknown = np.zeros(len(pixels))
-        return _Indexed(uv, make_structure(grey, pixels, unknown, unknown, mask, indexed=self.flying))
+        return _Indexed(uv, make_structure(grey, pixels, unknown, unknown, mask))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,9 @@ from edgeslam_torch.mapping.edge_association import EdgeField, associate_edges, 
 from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms
 from edgeslam_torch.types import Edges, FloatArray, IntArray
 
+ARM_REACH_PX = 4.5
+"""Distance in position and direction within which an edge lies on an arm: 2 px and 25 degrees."""
+
 UNKNOWN_SIGMA_LOG = 0.35
 """Relative sigma of a corner's depths without a measurement."""
 
@@ -79,7 +82,6 @@ def make_structure(
     inverse_depth: FloatArray,
     sigma: FloatArray,
     mask: NDArray[np.bool_] | None = None,
-    indexed: bool = True,
 ) -> Structure:
     """Index a keyframe's edges of known depth for its neighbours.
 
@@ -89,7 +91,6 @@ def make_structure(
         inverse_depth: ``(E,)`` [1/m].
         sigma: ``(E,)`` standard deviations [1/m].
         mask: ``(H, W)`` Canny edges, for L-junctions; without it none are detected.
-        indexed: As `edge_field` takes it.
     """
     height, width = grey.shape
     smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)
@@ -98,7 +99,7 @@ def make_structure(
     normal = _unit(np.stack(gradient, 1)).astype(np.float32)
     edges = Edges(np.asarray(uv, dtype=np.float32).reshape(-1, 2), normal, np.repeat(grey[v, u][:, None], 3, 1))
     junctions = None if mask is None else detect_junctions(grey, mask)
-    return Structure(edge_field(edges, inverse_depth, (width, height), indexed), np.asarray(sigma), junctions)
+    return Structure(edge_field(edges, inverse_depth, (width, height)), np.asarray(sigma), junctions)
 
 
 def nearest_poses(T_c_w: FloatArray, count: int) -> IntArray:
@@ -235,9 +236,11 @@ def _junction_depths(structure: Structure, config: TermConfig) -> tuple[FloatArr
         return *collinearity_prior(np.full_like(nothing, np.nan), nothing, nothing), np.zeros(len(uv), bool)
     across = np.stack([-junctions.arms[..., 1], junctions.arms[..., 0]], -1)[:, :, None] * np.ones(uv.shape[2:])
     # The bright side of an arm is unknown: search both.
-    sides = [nearest_edges(field, uv.reshape(-1, 2), sign * across.reshape(-1, 2)) for sign in (1.0, -1.0)]
+    sides = [
+        nearest_edges(field, uv.reshape(-1, 2), sign * across.reshape(-1, 2), ARM_REACH_PX) for sign in (1.0, -1.0)
+    ]
     partner = np.stack(sides).reshape(2, *uv.shape[:-1])  # (2, C, 2, M)
-    away = np.linalg.norm(field.edges.uv[partner] - uv, axis=-1)
+    away = np.where(partner < 0, np.inf, np.linalg.norm(field.edges.uv[partner] - uv, axis=-1))
     best = away.argmin(0)[None]
     partner = np.take_along_axis(partner, best, 0)[0]
     near = np.take_along_axis(away, best, 0)[0] <= 2.0

@@ -4,11 +4,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import lapack
 
 from edgeslam_torch.optim.blocks import Anchors, Blocks, Edges, Junctions, Normal
 from edgeslam_torch.optim.kernels import rows as compiled
-from edgeslam_torch.optim.kernels.normal_equations import back_substitute, eliminate
+from edgeslam_torch.optim.kernels.normal_equations import back_substitute, eliminate, solve_triangular
 from edgeslam_torch.optim.kernels.pose import stepped
 from edgeslam_torch.optim.levenberg_marquardt import Step, minimise
 from edgeslam_torch.optim.motion_factors import MotionTerms
@@ -83,13 +82,14 @@ class Window:
         S, right, factors = self._reduce(system, mu)
         diagonal = system.H.diagonal()
         np.einsum("ii->i", S)[:] += mu * diagonal + _FLOOR
-        delta, sigmas = np.zeros(len(right)), math.inf
+        delta: FloatArray = np.zeros(len(right))
+        sigmas = math.inf
         if len(delta):
-            # LAPACK is column-major: numpy's upper triangle is its lower one.
-            L, failed = lapack.dpotrf(S.T, lower=1, overwrite_a=1)
-            if failed:
+            try:
+                U = np.linalg.cholesky(S, upper=True)
+            except np.linalg.LinAlgError:
                 return None
-            delta = -lapack.dpotrs(L, right, lower=1)[0]
+            delta = -solve_triangular(U, right)
             sigmas = math.sqrt(max(0.0, -float(delta @ right)))
         predicted = _promise(mu, diagonal, system.g, delta)
         size = _largest(delta)

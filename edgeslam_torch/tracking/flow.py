@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from edgeslam_torch.config import FlowConfig, OrbConfig
+from edgeslam_torch.frontend.keypoint_grid import nearest_pixels
 from edgeslam_torch.frontend.orb import spread
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
@@ -122,8 +122,8 @@ def join(track: Track, followed: Followed, view: View, scale_factor: float) -> T
     if len(free) == 0:
         return track
     anchor, octave = followed.track.anchor[missing], followed.octave[missing]
-    distance, nearest = cKDTree(view.features.uv[free]).query(followed.uv[missing])
-    keypoint = free[nearest]
+    distance, nearest = nearest_pixels(view.features.uv[free], followed.uv[missing], 1)
+    distance, keypoint = distance[:, 0], free[nearest[:, 0]]
     near = distance < JOIN_PX * scale_factor**octave
     near &= np.abs(view.features.octave[keypoint] - octave) <= 1
     best_first = np.flatnonzero(near)[np.argsort(distance[near], kind="stable")]

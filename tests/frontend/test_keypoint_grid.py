@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
+from edgeslam_torch.frontend.keypoint_grid import KeypointGrid, nearest_pixels
 
 
 @pytest.mark.parametrize("count", [1, 60, 2000])
@@ -24,3 +25,12 @@ def test_nothing_is_near_nothing():
     assert len(grid) == 0
     assert [len(side) for side in grid.near(np.zeros((5, 2)), np.ones(5))] == [0, 0]
     assert [len(side) for side in KeypointGrid(np.ones((3, 2))).near(np.zeros((0, 2)), np.ones(0))] == [0, 0]
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_the_nearest_pixels_are_a_trees(rng, count):
+    uv, query = np.float32(rng.uniform(0, 300, (60, 2))), rng.uniform(-50, 350, (70, 2))
+    distance, nearest = nearest_pixels(uv, query, count)
+    apart, true = cKDTree(uv).query(query, k=[*range(1, count + 1)])
+    np.testing.assert_array_equal(nearest, true)
+    np.testing.assert_allclose(distance, apart, rtol=1e-12)

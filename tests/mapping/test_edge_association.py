@@ -107,8 +107,8 @@ def test_the_edge_that_runs_the_same_way_is_found_beside_a_nearer_crossing_one()
     normal = np.repeat(np.array([[1, 0], [0, 1]], np.float32), (41, 46), 0)
     field = edge_field(make_edges(uv, normal), np.zeros(87), SIZE)
     at = np.array([[103.0, 100.0]])  # the level one is nearer
-    assert nearest_edges(field, at, np.array([[1.0, 0.0]])) == 20
-    assert nearest_edges(field, at, np.array([[0.0, 1.0]])) == 41
+    assert nearest_edges(field, at, np.array([[1.0, 0.0]]), 5.0) == 20
+    assert nearest_edges(field, at, np.array([[0.0, 1.0]]), 5.0) == 41
 
 
 def test_no_edges_no_pairs(rng):
@@ -149,5 +149,5 @@ def test_edges_alone_recover_a_pose(rng):
 
 def test_every_edge_finds_itself(rng):
     edges, depth = see(np.eye(4), *segments(rng))
-    found = nearest_edges(edge_field(edges, depth, SIZE), edges.uv, edges.normal)
+    found = nearest_edges(edge_field(edges, depth, SIZE), edges.uv, edges.normal, 1.0)
     np.testing.assert_array_equal(found, np.arange(len(edges.uv)))

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.linalg.lapack import dposv
-from scipy.special import chdtri  # scipy.stats takes a second of CPU to import
 
 from edgeslam_torch.estimation.config import FusionConfig
+from edgeslam_torch.gate import exceedance
 from edgeslam_torch.geometry.rotations import (
     euler_rate_matrix,
     matrix_from_rpy,
@@ -42,8 +41,8 @@ _POSE, _CLONE = slice(0, 6), slice(9, 15)
 _CLONE_P, _CLONE_A = slice(9, 12), slice(12, 15)
 _SIZE = 15
 _NO_RATE = np.zeros(3)
-_GATE = {n: float(chdtri(n, 0.05)) for n in (3, 6)}
-"""Normalised innovation squared of attitude and of vision beyond which a measurement is refused: 95 %."""
+_UNLIKELY = 0.05
+"""Probability of a measurement's normalised innovation squared below which it is refused."""
 RECOVERS_AFTER = 5
 """Refusals in a row after which the covariance is inflated and the measurement taken."""
 _BLIND_S = 0.5
@@ -281,7 +280,7 @@ class Ekf:
         gain, weighted = _solved(S, P_Ht, residual)
         self.nis = float(residual.dot(weighted))
         outcome = Outcome.ACCEPTED
-        if not self.config.literal and self.nis > _GATE[n]:
+        if not self.config.literal and exceedance(self.nis, n) < _UNLIKELY:
             self.refused_in_row[n] += 1
             if self.refused_in_row[n] < RECOVERS_AFTER:
                 return Outcome.REFUSED
@@ -342,15 +341,13 @@ def _relative(x: FloatArray, T_clone_b: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def _solved(S: FloatArray, P_Ht: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """``S^-1 H P`` ``(n, 15)`` and ``S^-1 residual`` ``(n,)`` by one Cholesky factorisation.
-
-    LAPACK's own function: `numpy.linalg.solve` spends three times as long on checks.
-    """
-    columns = np.empty((len(residual), _SIZE + 1), order="F")
+    """``S^-1 H P`` ``(n, 15)`` and ``S^-1 residual`` ``(n,)`` by one factorisation."""
+    columns = np.empty((len(residual), _SIZE + 1))
     columns[:, :_SIZE] = P_Ht.T
     columns[:, _SIZE] = residual
-    _, solution, info = dposv(S, columns, overwrite_b=True)
-    if info != 0:  # not positive definite, from rounding errors only
+    try:
+        solution = np.linalg.solve(S, columns)
+    except np.linalg.LinAlgError:  # singular, from rounding errors only
         solution = np.linalg.lstsq(S, columns, rcond=None)[0]
     return solution[:, :_SIZE], solution[:, _SIZE]
 

@@ -17,10 +17,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
-from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.inertial.preintegration import Preintegrated, preintegrate
+from edgeslam_torch.geometry.rotations import matrices_from_vectors, rotated, vectors_from_matrices
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.noise import (
@@ -159,7 +158,7 @@ def align(
         metric = step < metric_steps
         deviation = np.concatenate(
             [
-                Rotation.from_matrix(mount[0].T @ x.R_i_c).as_rotvec(),
+                vectors_from_matrices(mount[0].T @ x.R_i_c),
                 x.t_i_c - lever,
                 [x.offset_s - mount[1]],
             ]
@@ -167,7 +166,7 @@ def align(
         system = _linearised(x, R_m_c, z, pre, whiten, walk, rate, offset_s, metric)
         try:
             by_node, by_all, covariance = _solved(*system, x.bias[0], deviation, sigma_known)
-        except (LinAlgError, ValueError):
+        except np.linalg.LinAlgError:
             return None
         x = _moved(x, by_node, by_all, metric)
         x = replace(x, covariance=covariance, sigma_pose=_error_sizes(x, R_m_c, z, pre.dt_s, floor, offset_s))
@@ -202,7 +201,7 @@ def _initial(
     else:
         R_i_c, offset_s, lever = start
         log_scale, sigma, R = 0.0, (_START_RAD, _START_SHARE * extent), R_m_c @ R_i_c.T
-        deviation = Rotation.from_matrix(_T(pre.R) @ _T(R[:-1]) @ R[1:]).as_rotvec()
+        deviation = vectors_from_matrices(_T(pre.R) @ _T(R[:-1]) @ R[1:])
         bias[:, :3] += np.linalg.lstsq(pre.by_bias[:, :3, :3].reshape(-1, 3), deviation.ravel(), rcond=None)[0]
         up = np.einsum("kij,kj->i", R[:-1], pre.v)
         gravity = -GRAVITY_M_S2 * up / np.linalg.norm(up)
@@ -219,10 +218,10 @@ def _errors(
     """Errors ``(N, 6)`` of the visual poses, rotation in the camera and position in the map's axes, and the IMU's
     rotation at the moments of the images. ``metric``: in metres, linear in the scale, to start from far away."""
     late, scale = x.offset_s - offset_s, math.exp(x.log_scale)
-    R = x.R_m_i if rate is None else x.R_m_i @ _exp((rate - x.bias[:, :3]) * late)
+    R = x.R_m_i if rate is None else x.R_m_i @ matrices_from_vectors((rate - x.bias[:, :3]) * late)
     centre = x.p_m_i + x.velocity * late + R @ x.t_i_c
     position = centre - scale * z if metric else centre / scale - z
-    return np.concatenate([Rotation.from_matrix(_T(R_m_c) @ R @ x.R_i_c).as_rotvec(), position], axis=1), R
+    return np.concatenate([vectors_from_matrices(_T(R_m_c) @ R @ x.R_i_c), position], axis=1), R
 
 
 def _error_sizes(
@@ -256,9 +255,9 @@ def _linearised(
     R0, R1, v0, v1 = x.R_m_i[:-1], x.R_m_i[1:], x.velocity[:-1], x.velocity[1:]
     R0_T, by_gravity = _T(R0), GRAVITY_M_S2 * _across(x.gravity)
     changed = np.einsum("kij,kj->ki", pre.by_bias, x.bias[:-1] - pre.bias)
-    sped = _rotated(R0_T, v1 - v0 - x.gravity * h)
-    went = _rotated(R0_T, np.diff(x.p_m_i, axis=0) - v0 * h - 0.5 * x.gravity * h**2)
-    r[:, :3] = Rotation.from_matrix(_T(pre.R @ _exp(changed[:, :3])) @ R0_T @ R1).as_rotvec()
+    sped = rotated(R0_T, v1 - v0 - x.gravity * h)
+    went = rotated(R0_T, np.diff(x.p_m_i, axis=0) - v0 * h - 0.5 * x.gravity * h**2)
+    r[:, :3] = vectors_from_matrices(_T(pre.R @ matrices_from_vectors(changed[:, :3])) @ R0_T @ R1)
     r[:, 3:6] = sped - pre.v - changed[:, 3:6]
     r[:, 6:9] = went - pre.p - changed[:, 6:]
     J[:, :3, :3], J[:, :3, 15:18] = -_T(R1) @ R0, I3
@@ -268,7 +267,7 @@ def _linearised(
     J[:, :9, 9:15] = -pre.by_bias
     J[:, 3:6, common + 1 : common + 3] = -(R0_T @ by_gravity) * h[:, :, None]
     J[:, 6:9, common + 1 : common + 3] = -0.5 * (R0_T @ by_gravity) * h[:, :, None] ** 2
-    r[:, :9], J[:, :9] = _rotated(whiten, r[:, :9]), whiten @ J[:, :9]
+    r[:, :9], J[:, :9] = rotated(whiten, r[:, :9]), whiten @ J[:, :9]
     weight, six = 1.0 / (walk * np.sqrt(h)), np.arange(6)
     r[:, 9:15] = weight * np.diff(x.bias, axis=0)
     J[:, 9 + six, 9 + six], J[:, 9 + six, 24 + six] = -weight, weight
@@ -330,19 +329,31 @@ def _solved(
     known = np.arange(3, _COMMON)
     corner[known, known] += sigma_known**-2
     common[known] += sigma_known**-2 * deviation
-    band = np.zeros((2 * n, n * N))
-    i, j = np.tril_indices(n)
-    band[(i - j)[None], n * np.arange(N)[:, None] + j] = own[:, i, j]
-    i, j = (index.ravel() for index in np.indices((n, n)))
-    coupling = (_T(J[:, :, n : 2 * n]) @ J[:, :, :n])[:, i, j]
-    band[(n + i - j)[None], n * np.arange(N - 1)[:, None] + j] = coupling
-    factor = cholesky_banded(band, lower=True, check_finite=True)
+    coupling = _T(J[:, :, :n]) @ J[:, :, n : 2 * n]
     across = border.reshape(-1, _COMMON)
-    solved = cho_solve_banded((factor, True), np.column_stack([across, slope.ravel()]))
+    solved = _block_tridiagonal(own, coupling, np.concatenate([border, slope[:, :, None]], axis=2))
+    solved = solved.reshape(-1, _COMMON + 1)
     covariance = np.linalg.inv(corner - across.T @ solved[:, :-1])
     covariance = 0.5 * (covariance + covariance.T)
     by_all = -covariance @ (common - across.T @ solved[:, -1])
     return -(solved[:, -1] + solved[:, :-1] @ by_all).reshape(N, n), by_all, covariance
+
+
+def _block_tridiagonal(own: FloatArray, coupling: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve a symmetric system of blocks on the diagonal ``(N, n, n)`` and beside it ``(N - 1, n, n)``, rows by columns
+    of the next block, for right sides ``(N, n, m)`` (Thomas)."""
+    n = own.shape[1]
+    own, x = own.copy(), right.copy()
+    by_next = np.empty_like(coupling)
+    for k, C in enumerate(coupling):
+        solved = np.linalg.solve(own[k], np.concatenate([C, x[k]], axis=1))
+        by_next[k], x[k] = solved[:, :n], solved[:, n:]
+        own[k + 1] -= C.T @ by_next[k]
+        x[k + 1] -= C.T @ x[k]
+    x[-1] = np.linalg.solve(own[-1], x[-1])
+    for k in range(len(coupling) - 1, -1, -1):
+        x[k] -= by_next[k] @ x[k + 1]
+    return x
 
 
 def _moved(x: Alignment, by_node: FloatArray, by_all: FloatArray, linear: bool) -> Alignment:
@@ -351,13 +362,13 @@ def _moved(x: Alignment, by_node: FloatArray, by_all: FloatArray, linear: bool) 
     gravity = x.gravity + GRAVITY_M_S2 * _across(x.gravity) @ by_all[_GRAVITY]
     return replace(
         x,
-        R_m_i=x.R_m_i @ _exp(by_node[:, :3]),
+        R_m_i=x.R_m_i @ matrices_from_vectors(by_node[:, :3]),
         p_m_i=x.p_m_i + by_node[:, 3:6],
         velocity=x.velocity + by_node[:, 6:9],
         bias=x.bias + by_node[:, 9:],
         log_scale=x.log_scale + grown,
         gravity=GRAVITY_M_S2 * gravity / np.linalg.norm(gravity),
-        R_i_c=x.R_i_c @ _exp(by_all[_MOUNT]),
+        R_i_c=x.R_i_c @ matrices_from_vectors(by_all[_MOUNT]),
         t_i_c=x.t_i_c + by_all[_LEVER],
         offset_s=x.offset_s + by_all[_OFFSET],
     )
@@ -368,13 +379,5 @@ def _across(direction: FloatArray) -> FloatArray:
     return np.linalg.svd(direction[None])[2][1:].T
 
 
-def _exp(rotvec: FloatArray) -> FloatArray:
-    return Rotation.from_rotvec(rotvec).as_matrix()
-
-
 def _T(R: FloatArray) -> FloatArray:
     return np.swapaxes(R, -1, -2)
-
-
-def _rotated(R: FloatArray, p: FloatArray) -> FloatArray:
-    return np.einsum("kij,kj->ki", R, p)

@@ -77,6 +77,17 @@ def preintegrate(
 
 
 @compiled()
+def _product(A: FloatArray, B: FloatArray) -> FloatArray:
+    """``A @ B`` in loops: numba's own loads all of SciPy."""
+    out = np.zeros((A.shape[0], B.shape[1]))
+    for i in range(A.shape[0]):
+        for k in range(A.shape[1]):
+            for j in range(B.shape[1]):
+                out[i, j] += A[i, k] * B[k, j]
+    return out
+
+
+@compiled()
 def _exp(w: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rotation of a vector ``(3,)``, and its right Jacobian."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -86,7 +97,8 @@ def _exp(w: FloatArray) -> tuple[FloatArray, FloatArray]:
     else:
         a, b, c = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2, (1.0 - np.sin(angle) / angle) / angle2
     W = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-    return np.eye(3) + a * W + b * (W @ W), np.eye(3) - b * W + c * (W @ W)
+    square = _product(W, W)
+    return np.eye(3) + a * W + b * square, np.eye(3) - b * W + c * square
 
 
 @compiled("f8[::1], f8[:,::1], f8[::1], f8[::1], f8, f8, f8")
@@ -103,6 +115,7 @@ def _preintegrate(
     all_R, all_v, all_p = np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros((count, 3))
     all_covariance, all_by_bias = np.zeros((count, 9, 9)), np.zeros((count, 9, 6))
     complete = np.zeros(count, dtype=np.bool_)
+    psd = np.repeat(np.array([gyroscope_psd, accelerometer_psd]), 3)
     n = 0
     for k in range(count):
         R, v, p = np.eye(3), np.zeros(3), np.zeros(3)
@@ -124,27 +137,25 @@ def _preintegrate(
             w, a = mean[:3], mean[3:]
             E, right = _exp(w * h)
             E_half, right_half = _exp(w * (0.5 * h))
-            R_half = R @ E_half
+            R_half = _product(R, E_half)
             A = np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
-            turned = -(R_half @ A)  # acceleration by the rotation at the middle of the step
+            turned = -_product(R_half, A)  # acceleration by the rotation at the middle of the step
             F, G = np.eye(9), np.zeros((9, 6))
             F[:3, :3] = E.T
-            F[3:6, :3] = h * (turned @ E_half.T)
+            F[3:6, :3] = h * _product(turned, E_half.T)
             F[6:, :3] = 0.5 * h * F[3:6, :3]
             G[:3, :3] = -h * right
-            G[3:6, :3] = -0.5 * h * h * (turned @ right_half)
+            G[3:6, :3] = -0.5 * h * h * _product(turned, right_half)
             G[3:6, 3:] = -h * R_half
             G[6:, :] = 0.5 * h * G[3:6, :]
             for i in range(3):
                 F[6 + i, 3 + i] = h
-            by_bias = F @ by_bias + G
-            covariance = F @ covariance @ F.T
-            covariance += (gyroscope_psd / h) * (np.ascontiguousarray(G[:, :3]) @ np.ascontiguousarray(G[:, :3]).T)
-            covariance += (accelerometer_psd / h) * (np.ascontiguousarray(G[:, 3:]) @ np.ascontiguousarray(G[:, 3:]).T)
-            a_start = R_half @ a
+            by_bias = _product(F, by_bias) + G
+            covariance = _product(_product(F, covariance), F.T) + _product(G * (psd / h), G.T)
+            a_start = _product(R_half, a.reshape(3, 1))[:, 0]
             p += h * v + 0.5 * h * h * a_start
             v += h * a_start
-            R = R @ E
+            R[:] = _product(R, E)
         all_R[k], all_v[k], all_p[k] = R, v, p
         all_covariance[k], all_by_bias[k], complete[k] = covariance, by_bias, covered
     return all_R, all_v, all_p, all_covariance, all_by_bias, complete

@@ -4,9 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.geometry.rotations import mean_rotation
+from edgeslam_torch.geometry.rotations import matrices_from_vectors, mean_rotation, vectors_from_matrices
 from edgeslam_torch.noise import LEVEL_RAD, UP_MEMORY_S
 from edgeslam_torch.types import FloatArray
 
@@ -55,9 +54,9 @@ def mount_by_turns(
     covariance = np.linalg.inv(np.einsum("ain,naj->ij", weighted, J) + prior)
     turned = np.zeros(6)
     for _ in range(_STEPS):
-        map_turned, mount_turned = Rotation.from_rotvec(turned.reshape(2, 3)).as_matrix()
-        error = Rotation.from_matrix(R_b_w @ map_turned @ R_w_m @ R_m_c @ (mount_turned @ R_b_c).T).as_rotvec()
+        map_turned, mount_turned = matrices_from_vectors(turned.reshape(2, 3))
+        error = vectors_from_matrices(R_b_w @ map_turned @ R_w_m @ R_m_c @ (mount_turned @ R_b_c).T)
         turned -= covariance @ (np.einsum("ain,na->i", weighted, error) + prior @ turned)
-    map_turned, mount_turned = Rotation.from_rotvec(turned.reshape(2, 3)).as_matrix()
+    map_turned, mount_turned = matrices_from_vectors(turned.reshape(2, 3))
     sigma = np.sqrt(np.diag(covariance)[:3] + _BENT_RAD**2)
     return Turned(mount_turned @ R_b_c, map_turned @ R_w_m, sigma)

@@ -16,7 +16,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve, lapack
 
 from edgeslam_torch.estimation.scale.belief import ScaleBelief
 from edgeslam_torch.geometry.robust_statistics import RMS_MEDIAN_3DOF, median, robust_sigma, tukey_weight
@@ -355,10 +354,10 @@ def _fitted(
     n = len(white)
     C = slow.copy()
     C.flat[:: n + 1] += white
-    factor, info = lapack.dpotrf(C, lower=True)
-    if info != 0:
+    sign, spent = np.linalg.slogdet(C)
+    if sign <= 0:
         return None
-    inverse = cho_solve((factor, True), np.eye(n), check_finite=False)
+    inverse = np.linalg.inv(C)
     A = np.einsum("anu,anv->uv", latent, inverse @ J)  # J is (axes, N, unknowns)
     A = 0.5 * (A + A.T)
     v = np.einsum("anu,anx->u", latent, inverse @ target)
@@ -371,7 +370,7 @@ def _fitted(
     dof = residual.size + _BELIEF
     kappa = (float(np.sum(residual * whitened)) + _BELIEF) / dof
     sign, logdet = np.linalg.slogdet(A + prior)
-    spent = 2.0 * len(J) * float(np.sum(np.log(np.diag(factor)))) + (float(logdet) if sign > 0 else math.inf)
+    spent = len(J) * float(spent) + (float(logdet) if sign > 0 else math.inf)
     likely = -0.5 * (dof * math.log(kappa) + spent)
     trace = float(np.trace(inverse)) / kappa
     return _Fit(theta, A / kappa, v / kappa, residual, whitened, whitened @ slow, trace, kappa, likely)

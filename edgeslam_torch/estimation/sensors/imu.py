@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from copy import copy
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.inertial.alignment import Alignment, align
 from edgeslam_torch.estimation.inertial.preintegration import HELD_S, preintegrate
 from edgeslam_torch.estimation.scale.belief import ScaleBelief
 from edgeslam_torch.geometry.gyroscope_check import checked_against_rotation
+from edgeslam_torch.geometry.rotations import fitted_rotation, smallest_rotation, vectors_from_matrices
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.types import FloatArray
 
@@ -146,7 +146,7 @@ class Imu:
         """Rotation ``(3, 3)`` from the map to a world whose z is up, if the vertical is accurate."""
         if self.up is None or self.up[1] > _UPRIGHT_RAD:
             return None
-        return Rotation.align_vectors([[0.0, 0.0, 1.0]], [self.up[0]])[0].as_matrix()
+        return smallest_rotation(self.up[0], np.array([0.0, 0.0, 1.0]))
 
     def turned(self, from_s: float, to_s: float) -> FloatArray | None:
         """Rotation ``R_c1_c0`` ``(3, 3)`` of the camera between two frames; None without readings or mount."""
@@ -193,7 +193,7 @@ class Imu:
             return {}
         numbers: dict[str, float] = {"imu readings": len(self)}
         if (found := self.alignment) is not None:
-            unit, mount = math.exp(found.log_scale), np.rad2deg(Rotation.from_matrix(found.R_i_c).as_rotvec())
+            unit, mount = math.exp(found.log_scale), np.rad2deg(vectors_from_matrices(found.R_i_c))
             numbers |= {f"imu mount {axis} deg": float(angle) for axis, angle in zip("xyz", mount, strict=True)}
             numbers |= {
                 "scale imu": unit,
@@ -241,7 +241,7 @@ def imu_mount(
     near = dt < 0.3
     if near.sum() < 10:
         return None
-    turned = Rotation.from_matrix(np.swapaxes(R_m_c[:-1], 1, 2) @ R_m_c[1:]).as_rotvec()[near] / dt[near, None]
+    turned = vectors_from_matrices(np.swapaxes(R_m_c[:-1], 1, 2) @ R_m_c[1:])[near] / dt[near, None]
     turned -= np.median(turned, axis=0)
     steps = np.diff(readings.stamps_s)[:, None]
     rate = readings.angular_rate_rad_s
@@ -254,11 +254,7 @@ def imu_mount(
         at = np.stack([np.interp(moments, readings.stamps_s, angle[:, i]) for i in range(3)], axis=1)
         rate_i = (np.diff(at, axis=0) / dt[:, None])[near]
         rate_i -= np.median(rate_i, axis=0)
-        R = (
-            model.T_imu_cam[:3, :3]
-            if model.T_imu_cam is not None
-            else Rotation.align_vectors(rate_i, turned)[0].as_matrix()
-        )
+        R = fitted_rotation(turned, rate_i) if model.T_imu_cam is None else model.T_imu_cam[:3, :3]
         cost[k] = float(np.sum((rate_i - turned @ R.T) ** 2))
         found.append((R, rate_i))
     best = int(np.argmin(cost))

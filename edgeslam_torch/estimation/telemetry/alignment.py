@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.scale.camera_mount import mount_by_turns
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, Sightings
-from edgeslam_torch.geometry.rotations import mean_rotation
+from edgeslam_torch.geometry.rotations import mean_rotation, rpy_from_matrix, vectors_from_matrices
 from edgeslam_torch.types import FloatArray
 
 LATELY = 5
@@ -68,8 +67,8 @@ def attitude_deviation(reported: Attitudes, R_b_c: FloatArray, sigma_rad: float)
     """
     turned = mount_by_turns(reported.R_m_c, reported.R_w_b, reported.stamp_s, R_b_c, sigma_rad)
     seen = turned.R_w_m @ reported.R_m_c @ turned.R_b_c.T
-    off = Rotation.from_matrix(np.swapaxes(seen, 1, 2) @ reported.R_w_b).as_rotvec()
-    rpy = np.unwrap(Rotation.from_matrix(seen).as_euler("ZYX")[:, ::-1], axis=0)
+    off = vectors_from_matrices(np.swapaxes(seen, 1, 2) @ reported.R_w_b)
+    rpy = np.unwrap([rpy_from_matrix(R) for R in seen], axis=0)
     rate = np.diff(rpy, axis=0) / np.diff(reported.stamp_s)[:, None]
     rms = [np.sqrt(np.mean(x**2, axis=0)) for x in (off, off[-LATELY:], rate)]
     return AttitudeDeviation(rms[0], rms[1], np.std(rpy, axis=0), rms[2])

@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.estimation.config import MIN_SPEED_M_S, FusionConfig
 from edgeslam_torch.estimation.scale.belief import ScaleBelief
@@ -31,6 +30,7 @@ from edgeslam_torch.estimation.telemetry.sensor_validation import (
 )
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack, Turn
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory
+from edgeslam_torch.geometry.rotations import vectors_from_matrices
 from edgeslam_torch.noise import MOUNT_RAD
 from edgeslam_torch.types import FloatArray
 
@@ -155,9 +155,7 @@ class Comparison:
         if len(moved) == 0:
             return None
         both = turns(moved, present.track, present.R_b_c)
-        seen, reported = (
-            Rotation.from_matrix(R).as_rotvec() / moved.duration_s[:, None] for R in (both.seen, both.reported)
-        )
+        seen, reported = (vectors_from_matrices(R) / moved.duration_s[:, None] for R in (both.seen, both.reported))
         found = agreement(seen, reported, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
         return replace(found, broken=self._broken_attitude(present, delay))
 

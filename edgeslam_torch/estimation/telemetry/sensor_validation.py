@@ -12,7 +12,6 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit
 
 from edgeslam_torch.estimation.telemetry.track import Turn
 from edgeslam_torch.geometry.robust_statistics import median
@@ -183,7 +182,7 @@ def unproven_columns(seen: FloatArray, reported: FloatArray) -> tuple[float, ...
         for x in (expected, -expected, reported.mean(axis=0))
     )
     log_odds = _PRIOR_LOG_ODDS + 0.5 * (np.minimum(mirrored, frozen) - right)
-    return tuple(expit(-log_odds).tolist())
+    return tuple((0.5 - 0.5 * np.tanh(0.5 * log_odds)).tolist())
 
 
 def _ratio(seen: FloatArray, reported: FloatArray) -> float:

@@ -236,3 +236,18 @@ def back_substitute(
                 x[i] -= L[k, i] * x[k]
             x[i] *= L[i, i]
     return step
+
+
+@compiled("f8[:,::1], f8[::1]")
+def solve_triangular(U: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution ``(n,)`` of ``U^T U x = right`` for an upper triangular ``U`` ``(n, n)``."""
+    x = right.copy()
+    for i in range(len(x)):
+        x[i] /= U[i, i]
+        for j in range(i + 1, len(x)):
+            x[j] -= U[i, j] * x[i]
+    for i in range(len(x) - 1, -1, -1):
+        for j in range(i + 1, len(x)):
+            x[i] -= U[i, j] * x[j]
+        x[i] /= U[i, i]
+    return x

@@ -298,10 +298,14 @@ def _with_prior(
             for j in range(3):
                 E[0, i, 3] -= E[0, i, j] * prior[0][n, j, 3]
         e, J = logs(E)
-        slope = prior[1][n] @ e[0]
-        H += J[0].T @ (prior[1][n] @ J[0])
-        g += J[0].T @ slope
-        cost += e[0] @ slope
+        for i in range(6):
+            for j in range(6):
+                known = prior[1][n, i, j]
+                cost += e[0, i] * known * e[0, j]
+                for a in range(6):
+                    g[a] += J[0, i, a] * known * e[0, j]
+                    for b in range(6):
+                        H[a, b] += J[0, i, a] * known * J[0, j, b]
     return H, g, cost, chi2
 
 
