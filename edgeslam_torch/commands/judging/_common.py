@@ -1,5 +1,6 @@
 """What the commands that run experiments share."""
 
+import argparse
 import os
 import sys
 from collections.abc import Iterator
@@ -7,6 +8,24 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.output_file import output_file
+
+
+def add_runs_to(parser: argparse.ArgumentParser, seeds: int) -> None:
+    """Declare the options of commands that run sequences of a folder with several seeds."""
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of recordings (default: EDGESLAM_DATA)")
+    parser.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"runs of everything (default: {seeds})")
+    parser.add_argument(
+        "--sequence", action="append", default=[], metavar="NAME", help="only this one; may be repeated"
+    )
+    parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change a setting of all runs"
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="results; finished runs are not repeated (default: runs/NAME-TIME)"
+    )
+    parser.add_argument("--markdown", type=output_file, metavar="FILE", help="also write the tables here")
 
 
 def recordings(given: Path | None) -> Path | None:

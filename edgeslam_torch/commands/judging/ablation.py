@@ -4,26 +4,15 @@ import argparse
 import time
 from pathlib import Path
 
-from edgeslam_torch.commands.judging._common import recordings, say, writing
+from edgeslam_torch.commands.judging._common import add_runs_to, recordings, say, writing
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.files.output_file import output_file
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of recordings (default: EDGESLAM_DATA)")
-    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="runs of every row (default: 2)")
-    parser.add_argument(
-        "--sequence", action="append", default=[], metavar="NAME", help="only this one; may be repeated"
-    )
+    add_runs_to(parser, seeds=2)
     parser.add_argument("--row", action="append", default=[], metavar="NAME", help="only this row; may be repeated")
-    parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change all rows")
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the results; finished runs are not repeated"
-    )
-    parser.add_argument("--markdown", type=output_file, metavar="FILE", help="also write the tables here")
 
 
 def main(args: argparse.Namespace) -> int:

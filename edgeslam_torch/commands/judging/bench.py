@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from edgeslam_torch.commands.judging._common import recordings, say, writing
+from edgeslam_torch.commands.judging._common import add_runs_to, recordings, say, writing
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.output_file import output_file
@@ -14,11 +14,7 @@ from edgeslam_torch.files.output_file import output_file
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of recordings (default: EDGESLAM_DATA)")
-    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="runs of every sequence (default: 3)")
-    parser.add_argument(
-        "--sequence", action="append", default=[], metavar="NAME", help="only this one; may be repeated"
-    )
+    add_runs_to(parser, seeds=3)
     parser.add_argument(
         "--get",
         action="append",
@@ -27,9 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="fetch this published recording first, and run only such; may be repeated ('readme': those of the README)",
     )
     parser.add_argument("--agree", action="store_true", help="agree to the licences of --get, which are printed")
-    parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
     parser.add_argument("--mode", choices=("offline", "realtime"), default="offline")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting")
     parser.add_argument(
         "--depth",
         action="append",
@@ -60,9 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "time",
     )
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="of those flights at a time (default: 1)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the runs (default: runs/bench-TIME)")
     parser.add_argument("--json", type=output_file, metavar="FILE", help="also write the results here")
-    parser.add_argument("--markdown", type=output_file, metavar="FILE", help="also write the tables here")
     parser.add_argument(
         "--compare", nargs=2, type=Path, metavar=("A", "B"), help="only compare two results, A before B"
     )
