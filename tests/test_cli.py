@@ -119,19 +119,13 @@ MISTAKES = [
     (["run", "{seq}", "--telemetry", "{tmp}/t.csv"], 1, "t.csv: no such telemetry file"),
     (["run", "{seq}", "--config", "{tmp}/c.toml"], 1, "c.toml: No such file"),
     (["run", "{seq}", "--set", "orb.feature=3"], 1, "did you mean 'orb.features'"),
-    (["run", "{seq}", "--set", "orb.features=0"], 1, "features must be positive"),
     (["run", "{seq}", "--set", "fusion.velocity_step_m_s=0"], 1, "velocity_step_m_s must be positive"),
     (["run", "{seq}", "--out", "{seq}"], 1, "is the source itself"),
     (["run", "{seq}", "--out", "{seq}/rgb.txt/x"], 1, "cannot write results there"),
     (["run", "{seq}", "--max-frames", "0"], 2, "must be a whole number of at least 1, got '0'"),
-    (["run", "{seq}", "--max-frames", "many"], 2, "got 'many'"),
     (["run", "{seq}", "--max-frames", "9" * 20], 2, "whole number of at least 1"),
     (["run", "{seq}", "--seed", "9" * 20], 2, "--seed: must be a whole number of at most 32 bits"),
     (["run", "{seq}", "--seed=-1"], 1, "--seed: seed must be at least 0, got -1"),
-    (["run", "{seq}", "--set", "seed=" + "9" * 20], 1, "seed must be within 32 bits"),
-    (["run", "{seq}", "--set", "fusion.delay_s=nan"], 1, "fusion.delay_s must be finite, got nan"),
-    (["run", "{seq}", "--set", "orb.levels=" + "[" * 9999], 1, "orb.levels must be an integer"),
-    (["run", "{seq}", "--config", "{tmp}/deep.toml"], 1, "deep.toml: not valid TOML (nested too deeply)"),
     (["demo", "--seconds", "nan"], 2, "--seconds: must be a finite number, got 'nan'"),
     (["sim", "--seed=-1"], 1, "--seed must be at least 0"),
     (["report", "{tmp}/deep"], 1, "summary.json: not valid JSON (nested too deeply)"),
@@ -154,7 +148,6 @@ def test_mistake_gets_one_line_and_no_traceback(edgeslam, recording, tmp_path, w
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "trajectory.txt").write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
     (tmp_path / "deep" / "summary.json").write_text("[" * 100_000)
-    (tmp_path / "deep.toml").write_text("seed = " + "[" * 100_000)
     got, out, err = edgeslam(*(word.format(tmp=tmp_path, seq=recording) for word in words))
     assert got == code
     lines = [line for line in err.splitlines() if "error:" in line]

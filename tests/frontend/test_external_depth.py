@@ -218,11 +218,6 @@ def test_weights_that_come_with_the_package_have_names(image):
     assert weights_file("a/b.safetensors") == Path("a/b.safetensors")
 
 
-def test_an_unknown_name_lists_the_available_ones():
-    with pytest.raises(WeightsError, match="midas-small"):
-        weights_path("midas_small")
-
-
 @pytest.mark.parametrize(
     ("numbers", "described"),
     [

@@ -193,12 +193,6 @@ def test_source_folder_is_not_written_into(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_folder_that_cannot_be_made(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot write results there"):
-        RunWriter(tmp_path / "file" / "out")
-
-
 def test_full_disk_leaves_whole_lines_and_room_for_the_rest(tmp_path, monkeypatch):
     disk = FullDisk(monkeypatch, "trajectory_online.txt")
     writer = RunWriter(tmp_path)
