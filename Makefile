@@ -15,7 +15,7 @@ JUDGE_ARGS ?=
 STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help install demo test test-slow mutation lint docs results notebooks wheel clean
+.PHONY: help install demo kernels test test-slow mutation lint docs results notebooks wheel clean
 
 help:
 	@echo "make demo | test | test-slow | mutation | lint | docs | results | wheel | clean"
@@ -37,8 +37,14 @@ demo: $(STAMP)
 # code is kept, also where the shell says no: commands that tests start would compile the package each time.
 PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
+# Loops are compiled once and cached, before both processes of the tests would compile them at the same time.
+COMPILE := import importlib, sys; from edgeslam_torch.compiled import compile_all; \
+	[importlib.import_module(path[:-3].replace("/", ".")) for path in sys.argv[1:]]; compile_all()
+kernels: $(STAMP)
+	@grep -rl --include='*.py' 'compiled import compiled' edgeslam_torch | sort | xargs -n 3 -P 2 $(BIN)/python -c '$(COMPILE)'
+
 # The examples in docstrings are tests too.
-test: $(STAMP)
+test: $(STAMP) kernels
 	$(PYTEST) --doctest-modules --doctest-ignore-import-errors tests edgeslam_torch $(PYTEST_ARGS)
 
 # What measures time, or must keep up with a flying drone, has the machine to itself. 5: nothing was selected.
