@@ -9,10 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
-# No deadline: how long one case takes says something about what else the machine does, not about the code.
-settings.register_profile("edgeslam", deadline=None)
+# No deadline: how long one case takes says something about what else the machine does, not about the code. What a test
+# leaves in its folder, the next case overwrites.
+settings.register_profile(
+    "edgeslam", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 settings.load_profile("edgeslam")
 
 

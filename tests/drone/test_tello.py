@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from emulated import PATIENCE_S, SwiftDrone, listen_in, until
 from free_ports import free_ports
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import edgeslam_torch.drone.tello as tello_module
@@ -480,7 +480,6 @@ def test_wrong_addresses_are_refused(text):
         TelloAddress.parse(text)
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.text(max_size=40))
 def test_any_address_is_read_or_refused(text):
     try:

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from edgeslam_torch.errors import SourceError
@@ -16,7 +16,6 @@ def written(tmp_path, text, encoding="utf-8"):
     return path
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.sampled_from([" ", "\t", ",", ";", ", ", " \t ", "; "]),
     st.sampled_from(["", "# t x y\n", "t{0}x{0}y\n", "#t{0}x{0}y\n"]),

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
@@ -61,7 +61,6 @@ def test_no_candidates():
 candidates = st.lists(st.tuples(st.integers(0, 8), st.integers(0, 8), st.integers(0, 90)), max_size=60)
 
 
-@settings(max_examples=60, deadline=None)
 @given(candidates)
 def test_best_pairs_are_one_to_one_within_limits_and_nearest(rows):
     unique = {(q, t): d for q, t, d in rows}

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from edgeslam_torch.drone.sdk_state import FIELDS, parse_state, sample_from_sdk
@@ -291,19 +291,16 @@ def _reads_or_refuses(folder, data):
     assert all(b > a for a, b in zip(stamps, stamps[1:], strict=False))
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(lines, max_size=12))
 def test_any_csv_is_read_or_refused(tmp_path, rows):
     _reads_or_refuses(tmp_path, "\n".join([",".join(HEADER), *rows]).encode("utf-8", "surrogatepass"))
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.binary(max_size=300))
 def test_any_bytes_are_read_or_refused(tmp_path, data):
     _reads_or_refuses(tmp_path, data)
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.one_of(st.binary(max_size=300), st.lists(st.tuples(st.sampled_from(FIELDS), cells)).map(
     lambda pairs: ";".join(f"{k}:{v}" for k, v in pairs).encode("utf-8", "surrogatepass"))))  # fmt: skip
 def test_any_packet_gives_a_sample(packet):

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from edgeslam_torch.drone.emulator.commands import Answer, Interpreter
@@ -155,7 +155,6 @@ def test_movements_on_the_ground_are_refused():
     assert interpreter.run("up 50").text == "error Not joystick"
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.one_of(st.text(max_size=60), st.sampled_from(["go", "rc", "curve", "forward", "speed", "flip"]).flatmap(
     lambda w: st.lists(st.text(max_size=5), max_size=8).map(lambda a: " ".join([w, *a])))))  # fmt: skip
 def test_any_line_is_answered(line):
