@@ -1,11 +1,12 @@
 """Plausibility of calibrations."""
 
+import cv2
 import numpy as np
 import pytest
 
 from edgeslam_torch.errors import CalibrationError
 from edgeslam_torch.geometry.camera import PRESETS, Camera
-from edgeslam_torch.geometry.lens import check_camera, unique_share
+from edgeslam_torch.geometry.lens import _distorted, check_camera, unique_share
 
 REAL = {
     # TUM RGB-D, KITTI raw 2011_09_26 camera 0, EuRoC cam0, a Tello by ROS camera_calibration: as published.
@@ -32,6 +33,20 @@ def test_the_invertible_share_of_a_barrel_ends_at_its_fold(k1):
     turn = 2.0 / 3.0 / np.sqrt(-3.0 * k1)
     corner = np.hypot(320.0, 240.0) / 400.0
     assert unique_share(camera) == pytest.approx(min(1.0, turn / corner), abs=0.01)
+
+
+def test_points_and_area_are_those_of_opencvs_projection(rng):
+    distortion = np.array([-0.2, 0.05, 0.01, -0.02, 0.003])
+    xy, h = rng.uniform(-0.8, 0.8, (2, 30)), 1e-5
+
+    def seen(xy):
+        p_c = np.concatenate([xy, np.ones((1, 30))]).T
+        return cv2.projectPoints(p_c, np.zeros(3), np.zeros(3), np.eye(3), distortion)[0][:, 0].T
+
+    points, area = _distorted(Camera(640, 480, 400.0, 400.0, 319.5, 239.5, tuple(distortion)), xy)
+    np.testing.assert_allclose(points, seen(xy), atol=1e-12)
+    by_x, by_y = ((seen(xy + step) - seen(xy - step)) / (2 * h) for step in h * np.eye(2)[:, :, None])
+    np.testing.assert_allclose(area, by_x[0] * by_y[1] - by_x[1] * by_y[0], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
