@@ -245,7 +245,7 @@ def _record_synthetic(out: Path, settings: BenchSettings, say: Callable[[str], N
         say("recording the synthetic flight ...")
         command = [sys.executable, "-m", "edgeslam_torch.cli", "demo", "--record-only", "--out", str(folder)]
         if settings.max_frames is not None:  # no longer than what is looked at, at the demo's 20 Hz
-            command += ["--seconds", str(max(2, -(-settings.max_frames // 20)))]
+            command += ["--duration", str(max(2, -(-settings.max_frames // 20)))]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise EvaluationError(f"the synthetic flight could not be recorded: {done.stderr.strip()[-300:]}")

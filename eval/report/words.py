@@ -131,17 +131,16 @@ def figures(run: RunFolder, score: RunScore | None) -> list[Value]:
     summary, frames = run.summary, _offered(run)
     scale, counts = record(summary.get("scale")), record(summary.get("map"))
     sigma = number(scale.get("sigma")) / (number(scale.get("value")) or math.nan)
-    judged_map = score.map if score is not None else None
+    ate_m, se3_m, rotation_deg, map_m = [math.nan] * 4
+    if score is not None:
+        ate_m, rotation_deg = score.ate_sim3_m, score.rotation_deg
+        se3_m = score.ate_se3_m if score.units == "metres" else math.nan
+        map_m = score.map.median_m if score.map is not None else math.nan
     return [
-        ("position error (ATE, Sim(3))", 100 * score.ate_sim3_m if score else math.nan, 2, "cm"),
-        (
-            "position error without scaling (SE(3))",
-            100 * score.ate_se3_m if score and score.units == "metres" else math.nan,
-            2,
-            "cm",
-        ),
-        ("rotation error", score.rotation_deg if score else math.nan, 2, "\u00b0"),
-        ("map error (median)", 100 * judged_map.median_m if judged_map else math.nan, 2, "cm"),
+        ("position error (ATE, Sim(3))", 100 * ate_m, 2, "cm"),
+        ("position error without scaling (SE(3))", 100 * se3_m, 2, "cm"),
+        ("rotation error", rotation_deg, 2, "\u00b0"),
+        ("map error (median)", 100 * map_m, 2, "cm"),
         ("frames", frames or len(run.trajectory), 0, ""),
         ("frames tracked", 100.0 * run.trusted_frames / frames if frames and run.status else math.nan, 1, "%"),
         ("times lost", number(summary.get("lost_events")), 0, ""),

@@ -39,6 +39,7 @@ def test_table_is_printed_written_and_compared(data, tmp_path, capsys):
         (["--first-seed", "-1"], "--jobs and --seeds must be at least 1, --first-seed at least 0"),
         (["--release", "0.3.json"], "a release needs all of its recordings; missing: 7scenes_redkitchen, "),
         (["--release", "0.3.json", "--only", "stairs"], "--release runs its own cells"),
+        (["--set", "base"], "--set base"),
         (["--jobs", "0"], "--jobs and --seeds must be at least 1, --first-seed at least 0"),
     ],
 )

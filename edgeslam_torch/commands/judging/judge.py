@@ -33,7 +33,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting of every run"
     )
-    parser.add_argument("--change", action="append", dest="set", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="results; finished cells are not repeated"
     )
@@ -50,18 +49,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run the missing cells, print and write the table; 1 when a cell has no result."""
+    from edgeslam_torch.config import SlamConfig
     from edgeslam_torch.eval.judge.cells import list_cells
     from edgeslam_torch.eval.judge.release import command_outputs, release_cells, release_record
     from edgeslam_torch.eval.judge.runner import RECORD, JudgeSettings, judge, read_record
     from edgeslam_torch.eval.judge.table import markdown, markdown_against
     from edgeslam_torch.eval.judge.thresholds import THRESHOLDS, read_thresholds
+    from edgeslam_torch.files.config_file import load_config
 
+    load_config(SlamConfig(), None, args.set)  # a setting that does not exist is said before anything is run
     data = recordings(args.data)
     thresholds = read_thresholds(args.thresholds or THRESHOLDS)
     before = read_record(args.against) if args.against is not None else None
-    old = [name for name in args.set if name in CELLS]
-    if old:
-        raise ConfigError(f"--set changes settings; which cells are run is said by --cells {old[0]}")
     if args.jobs < 1 or args.seeds < 1 or args.first_seed < 0:
         raise ConfigError("--jobs and --seeds must be at least 1, --first-seed at least 0")
     if args.release is not None and (args.only or args.set or args.max_frames):
