@@ -105,7 +105,7 @@ class ScaleEstimator:
     def decided(self) -> Decision:
         """Which sources are used; cached, since it is read several times a frame."""
         depth = self._depth.scale()
-        beliefs = [self._with_focal(b, _FOCAL_SHARE) for b in self._by_telemetry.values()]
+        beliefs = [self._with_common(b) for b in self._by_telemetry.values()]
         # An earlier flight's scale includes the network's; beside an IMU neither says anything.
         network = self.network() if self._remembered is None else self._remembered
         beliefs += [self.inertial] if self.inertial is not None else [network] if network is not None else []
@@ -122,9 +122,9 @@ class ScaleEstimator:
         """Scale by the drone's velocities and heights, if they are accurate enough."""
         used = {b.source for b in self.decided.used}
         measured = mean([belief for name, belief in self._by_telemetry.items() if name in used])
-        if measured is None or measured.sigma >= _BELIEVED:
+        if measured is None or math.hypot(measured.sigma, self.fit.noise_log) >= _BELIEVED:
             return None
-        return self._with_focal(measured, _FOCAL_SHARE)
+        return self._with_common(measured)
 
     def scale(self) -> ScaleEstimate:
         """Metres per map unit with sigma and source; unchanged without new measurements."""
@@ -149,6 +149,10 @@ class ScaleEstimator:
         whole uncertainty."""
         depth = self._depth.scale()
         return None if depth is None else self._with_focal(depth.belief, 1.0)
+
+    def _with_common(self, belief: ScaleBelief) -> ScaleBelief:
+        """With the errors that velocities and heights share: those of the map that both are compared with."""
+        return self._with_focal(replace(belief, sigma=math.hypot(belief.sigma, self.fit.noise_log)), _FOCAL_SHARE)
 
     def _with_focal(self, belief: ScaleBelief, share: float) -> ScaleBelief:
         """With a share of the focal length's error, which is common to all that a source measures."""

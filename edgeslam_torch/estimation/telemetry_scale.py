@@ -91,6 +91,9 @@ class TelemetryFit:
     """RMS residual of the displacements."""
     shortfall_m_s: float = 0.0
     """Expected truncation loss of every non-zero velocity reading."""
+    noise_log: float = 0.0
+    """Error of the log scale that velocities and heights share, by the map's noise: how much of the noise is the map's
+    is hardly known. It matters where the path is hardly longer than the noise."""
     truncates: float = 0.5
     """Probability that velocities are truncated, not rounded."""
 
@@ -179,11 +182,12 @@ class TelemetryScale:
         if torn:
             return {}, None
         velocity = {r: v for r, e in moved.items() if (v := self._by_velocity(r, e)) is not None} if compared else {}
-        height: ScaleBelief | None = None
+        noise_log = 0.0
         log_odds = {r: sweeps if r is Rounding.TRUNCATE else 0.0 for r in velocity or tried}
         if velocity:
             best = max(velocity, key=lambda r: moved[r].log_likelihood)
             height = self._height_alone(velocity[best], moved[best])
+            noise_log = max(abs(moved[r].noise_log) for r in velocity)
             count = 0 if self._shown is None else len(self._shown.intervals)
             counts = count / (count + _UNPROVEN)
             log_odds = {r: odds + counts * moved[r].log_likelihood for r, odds in log_odds.items()}
@@ -200,7 +204,7 @@ class TelemetryScale:
             rms = moved[max(velocity, key=lambda r: weight[r])].rms_m
         truncates = weight.get(Rounding.TRUNCATE, 0.0)
         shortfall_m_s = 0.5 * config.velocity_step_m_s if truncates > 0.5 else 0.0
-        fit = TelemetryFit(rms, shortfall_m_s, truncates) if found else None
+        fit = TelemetryFit(rms, shortfall_m_s, noise_log, truncates) if found else None
         return None if few and not found else found, fit
 
     def _by_velocity(self, rounding: Rounding, moved: Evidence) -> ScaleBelief | None:
@@ -218,7 +222,9 @@ class TelemetryScale:
         # Velocities less accurate than the scale difference between views cannot rule it out.
         vouching = moved if velocity is not None and velocity.sigma < _OF_A_VIEW else None
         evidence = self._by_height(rough, vouching)
-        return None if evidence is None else evidence.belief("height", self._tilt_rad, HEIGHT_SCALE_LOG)
+        if evidence is None:
+            return None
+        return evidence.belief("height", self._tilt_rad, math.hypot(HEIGHT_SCALE_LOG, evidence.noise_log))
 
     def _by_displacements(self, rounding: Rounding) -> Evidence | None:
         """Fit velocities to displacements; the quantisation remainders depend on the scale, so iterate to a fixed

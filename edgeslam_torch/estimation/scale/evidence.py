@@ -45,9 +45,6 @@ _MOST_PARTS = 4
 """Maximum number of parts of a flight whose scales are compared; shorter parts are too noisy."""
 _VIEW_RAD = math.radians(60.0)
 """Typical field of view."""
-_NOISE_SHARE_DOUBT = 1.0
-"""Standard deviation of the correction for noise in the regressor, as a share of it: how much of the noise is the map's
-is hardly known. It matters where the path is hardly longer than the noise: hover, rotation in place."""
 _LEAST_AGE_S = 1.0
 """Lower bound of the map's age."""
 _BIN_S = 0.5
@@ -69,6 +66,9 @@ class Evidence:
     """Of the displacements, up to a constant, for comparing models of the same data."""
     wander: float = MAP_WANDER_LOG[0]
     """Change of the map's log scale per e-fold of its age; estimated by displacements only."""
+    noise_log: float = 0.0
+    """Effect of the map's noise on the log scale: by how much the fit differs from plain least squares, or would if it
+    were corrected for correlated noise."""
     torn: bool = False
     """Whether no single scale fits most of the visual path."""
 
@@ -183,12 +183,12 @@ def displacement_evidence(
         return None
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(3.0 * float(weight.sum()), 1e-9))
     torn = float(weight @ np.sum(moved_map**2, axis=1)) < _MIN_EXPLAINED * length
-    evidence = Evidence(fit.information, fit.vector, rms, fit.log_likelihood, chosen[1], torn)
     slow = bias + pivoting + chosen[0] ** 2 * drifting + chosen[1] ** 2 * wandering
     covariance = slow + np.diag(sigma_m**2 + (s * sigma_map) ** 2)
     plain = _fitted(white, slow, J, J, target, prior)
-    doubt = 0.0 if plain is None else _NOISE_SHARE_DOUBT * (s - float(plain.theta[_SCALE]))
-    return evidence.softened(math.hypot(doubt, _unrest(covariance, fit, J, latent, target)))
+    noise_log = math.log(s / float(plain.theta[_SCALE])) if plain is not None and plain.theta[_SCALE] > 0 else 0.0
+    evidence = Evidence(fit.information, fit.vector, rms, fit.log_likelihood, chosen[1], noise_log, torn)
+    return evidence.softened(_unrest(covariance, fit, J, latent, target))
 
 
 def height_evidence(
@@ -265,6 +265,7 @@ def height_evidence(
     if fit is None:
         return None
     A, v = fit.information.copy(), fit.vector
+    noise_log = fit.slow_trace / max(scale**2 * float(A[_SCALE, _SCALE]), 1e-30)
     A[_SCALE, _SCALE] -= fit.inverse_trace * sigma_map**2 / float(np.mean(count))  # bias from noise in the regressor
     if not A[_SCALE, _SCALE] > 0:
         return None
@@ -272,7 +273,7 @@ def height_evidence(
     information = A[_THETA, _THETA] - A[_THETA, _OFFSETS] @ inner @ A[_OFFSETS, _THETA]
     vector = v[_THETA] - A[_THETA, _OFFSETS] @ inner @ v[_OFFSETS]
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(float(weight.sum()), 1e-9))
-    return Evidence(0.5 * (information + information.T), vector, rms)
+    return Evidence(0.5 * (information + information.T), vector, rms, noise_log=noise_log)
 
 
 def _unrest(covariance: FloatArray, fit: "_Fit", J: FloatArray, latent: FloatArray, target: FloatArray) -> float:
@@ -342,6 +343,8 @@ class _Fit:
     slow: FloatArray
     """``(axes, N)``, the part of the residual due to correlated noise."""
     inverse_trace: float
+    slow_trace: float
+    """Of the inverse covariance times the covariance of correlated noise."""
     kappa: float
     """Variance of the residuals over the expected one."""
     log_likelihood: float
@@ -372,5 +375,5 @@ def _fitted(
     sign, logdet = np.linalg.slogdet(A + prior)
     spent = len(J) * float(spent) + (float(logdet) if sign > 0 else math.inf)
     likely = -0.5 * (dof * math.log(kappa) + spent)
-    trace = float(np.trace(inverse)) / kappa
-    return _Fit(theta, A / kappa, v / kappa, residual, whitened, whitened @ slow, trace, kappa, likely)
+    trace, slow_trace = float(np.trace(inverse)) / kappa, float(np.sum(inverse * slow)) / kappa
+    return _Fit(theta, A / kappa, v / kappa, residual, whitened, whitened @ slow, trace, slow_trace, kappa, likely)
