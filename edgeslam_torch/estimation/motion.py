@@ -18,10 +18,10 @@ from edgeslam_torch.estimation.dead_reckoning import REACH_S as RECKONED_S
 from edgeslam_torch.estimation.dead_reckoning import Reckoned, reckoned
 from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.estimation.filter.filter_feed import FilterFeed, PoseEstimate
-from edgeslam_torch.estimation.health import disagreement
 from edgeslam_torch.estimation.orientation import Orientation
 from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.estimation.remembered import Remembered
+from edgeslam_torch.estimation.scale.belief import disagreement
 from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
 from edgeslam_torch.estimation.sensors.imu import REACH_S as IMU_REACH_S
 from edgeslam_torch.estimation.sensors.imu import Imu

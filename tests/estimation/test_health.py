@@ -4,8 +4,8 @@ from dataclasses import replace
 import pytest
 
 from edgeslam_torch.estimation.config import FusionConfig
-from edgeslam_torch.estimation.health import disagreement
 from edgeslam_torch.estimation.motion import MotionFusion
+from edgeslam_torch.estimation.scale.belief import disagreement
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 from edgeslam_torch.types import Health, ScaleEstimate

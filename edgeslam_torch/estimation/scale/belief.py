@@ -123,3 +123,14 @@ def mean(beliefs: Sequence[ScaleBelief]) -> ScaleBelief | None:
     if any(contradict(a, b) for a, b in itertools.combinations(beliefs, 2)):  # it may be that of either
         sigma = max(sigma, float(np.ptp(log_scale)))
     return ScaleBelief(centre, sigma, "+".join(dict.fromkeys(b.source for b in beliefs)))
+
+
+def disagreement(sources: Sequence[ScaleEstimate]) -> float:
+    """Largest distance between two sources in the logarithm, in standard deviations of their difference."""
+    return max(
+        (
+            abs(math.log(a.value / b.value)) / math.hypot(a.sigma / a.value, b.sigma / b.value)
+            for a, b in itertools.combinations(sources, 2)
+        ),
+        default=0.0,
+    )

@@ -19,14 +19,15 @@ from edgeslam_torch.estimation.telemetry.alignment import (
 from edgeslam_torch.estimation.telemetry.delay import GROWTH, Delay
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
     ATTITUDE,
+    SURELY_WRONG,
+    VELOCITY,
     Agreement,
     Reading,
     Reread,
     SensorGate,
     Verdict,
     agreement,
-    broken_columns,
-    unproven_columns,
+    wrong_columns,
 )
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack, Turn
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory
@@ -146,8 +147,9 @@ class Comparison:
         found = agreement(seen, reported, least_seen, slow, early=True)
         R_w = track.axes()[np.searchsorted(track.readings.stamp_s, 0.5 * (moved.from_s + moved.to_s))]
         seen, reported = (np.einsum("nwa,nw->na", R_w, v) for v in (seen, reported))
-        unproven = unproven_columns(seen, reported)
-        return replace(found, broken=broken_columns(seen, reported, unproven), unproven=unproven)
+        wrong = wrong_columns(seen, reported)
+        broken = tuple(name for name, share in zip(VELOCITY, wrong, strict=True) if share > SURELY_WRONG)
+        return replace(found, broken=broken, wrong=wrong)
 
     def _attitude(self, present: FlightSoFar, delay: Delay) -> Agreement | None:
         """Agreement of attitude with the images; None without common intervals."""

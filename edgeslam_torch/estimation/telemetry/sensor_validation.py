@@ -32,16 +32,15 @@ _EVEN = 0.8
 _WINSOR = 3.0
 """Winsorisation limit, in medians of the length."""
 _SMALL_SHARE = 0.3
-_KEPT = 0.9
-"""Share of the intervals used; the worst are dropped as outliers."""
-_LEFT_OVER, _LEFT_OVER_M_S = 0.5, 0.06
-"""Maximum RMS residual of one velocity column: a share of the speed along its axis, and the truncation error of steps
-of 0.1 m/s [m/s]."""
+_NOISE_M_S = 0.06
+"""Error of one velocity column: truncation in steps of 0.1 m/s."""
+_OUTLIER_SIGMAS = 4.0
+"""Residual of one interval beyond which it counts no more."""
 _MAP_SHARE = 0.15
 """Error of displacements of the map over half a second, as a share of them."""
 _PRIOR_LOG_ODDS = math.log(9.0)
 """Log-odds of a column to be right before any motion along its axis."""
-_SURELY_WRONG = 0.999
+SURELY_WRONG = 0.999
 """Probability at which a column contradicts the images: no single interval reaches it."""
 _WRONG_GAIN = 10.0
 """Standard deviation of the gain of a column that is frozen or of the wrong sign: it shows nothing."""
@@ -89,8 +88,8 @@ class Agreement:
     """Whether few intervals may validate it."""
     broken: tuple[str, ...] = ()
     """Columns that contradict the images individually: missing motion, frozen, jumping or of the wrong sign."""
-    unproven: tuple[float, ...] = (0.1, 0.1, 0.1)
-    """Probability of each velocity column to be frozen or of the wrong sign."""
+    wrong: tuple[float, ...] = (0.1, 0.1, 0.1)
+    """Probability of each velocity column to show another motion, see `wrong_columns`."""
 
     @property
     def share(self) -> float:
@@ -143,45 +142,26 @@ def agreement(
     return Agreement(varying, count, dimensions, _correlation(x, y), early)
 
 
-def broken_columns(seen: FloatArray, reported: FloatArray, unproven: tuple[float, ...]) -> tuple[str, ...]:
-    """Velocity columns that contradict the images individually.
+def wrong_columns(seen: FloatArray, reported: FloatArray) -> tuple[float, ...]:
+    """Probability of each velocity column to show another motion, as `Agreement.wrong`.
 
-    Args:
-        seen: By the images ``(N, 3)`` [map units/s], axes of the columns.
-        reported: By telemetry ``(N, 3)`` [m/s].
-        unproven: As `Agreement.unproven`.
-
-    Returns:
-        Names of the columns that are surely frozen or of the wrong sign, or whose residual exceeds the limit at the
-        best scale, without the worst intervals. The mean is included: a frozen velocity differs from the images by it.
-    """
-    wrong = np.array(unproven) > _SURELY_WRONG
-    if len(seen) < _TO_CONTRADICT:
-        return tuple(np.array(VELOCITY)[wrong].tolist())
-    scale = _ratio(seen, reported)
-    left = np.abs(reported - scale * seen)
-    kept = np.sort(left, axis=0)[: int(_KEPT * len(left))]
-    speed = np.sqrt(np.maximum(np.mean(reported**2, axis=0), scale**2 * np.mean(seen**2, axis=0)))
-    deviates = np.sqrt(np.mean(kept**2, axis=0)) > np.maximum(_LEFT_OVER * speed, _LEFT_OVER_M_S)
-    return tuple(name for name, off in zip(VELOCITY, (deviates | wrong).tolist(), strict=True) if off)
-
-
-def unproven_columns(seen: FloatArray, reported: FloatArray) -> tuple[float, ...]:
-    """Probability of each velocity column to be frozen or of the wrong sign, as `Agreement.unproven`.
-
-    Motion along one axis validates the readings as a whole, but shows nothing about the other columns.
+    A column is right, of the wrong sign, frozen, or a motion of the same size that is not the camera's. Motion along
+    one axis validates the readings as a whole, but shows nothing about the other columns.
 
     Args:
         seen: By the images ``(N, 3)`` [map units/s], axes of the columns.
         reported: By telemetry ``(N, 3)`` [m/s].
     """
     expected = _ratio(seen, reported) * seen
-    variance = _LEFT_OVER_M_S**2 + _MAP_SHARE**2 * np.sum(reported**2, axis=1, keepdims=True)
-    right, mirrored, frozen = (
-        np.sum(np.minimum((reported - x) ** 2 / variance, _WINSOR**2), axis=0)
-        for x in (expected, -expected, reported.mean(axis=0))
-    )
-    log_odds = _PRIOR_LOG_ODDS + 0.5 * (np.minimum(mirrored, frozen) - right)
+    noise = _NOISE_M_S**2 + _MAP_SHARE**2 * np.sum(reported**2, axis=1, keepdims=True)
+    power = np.maximum(np.mean(reported**2, axis=0), np.mean(expected**2, axis=0))
+
+    def cost(predicted: FloatArray, variance: FloatArray) -> FloatArray:
+        residual = np.minimum((reported - predicted) ** 2 / variance, _OUTLIER_SIGMAS**2)
+        return np.asarray(np.sum(residual + np.log(variance), axis=0))
+
+    others = cost(-expected, noise), cost(reported.mean(axis=0), noise), cost(expected, noise + power)
+    log_odds = _PRIOR_LOG_ODDS + 0.5 * (np.min(others, axis=0) - cost(expected, noise))
     return tuple((0.5 - 0.5 * np.tanh(0.5 * log_odds)).tolist())
 
 
@@ -275,7 +255,7 @@ class SensorGate:
     def gain_sigma(self) -> tuple[float, ...]:
         """Relative standard deviation of each velocity column."""
         latest = self.latest.get(Reading.VELOCITY, Agreement())
-        return tuple(_WRONG_GAIN * math.sqrt(share) for share in latest.unproven)
+        return tuple(_WRONG_GAIN * math.sqrt(share) for share in latest.wrong)
 
     @property
     def attitude(self) -> bool:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.estimation.health import disagreement
+from edgeslam_torch.estimation.scale.belief import disagreement
 from edgeslam_torch.flying.perception.home import GROUND_M, TAKE_OFF, Home, Place, metres_per_unit
 from edgeslam_torch.flying.perception.map_reset import MapReset
 from edgeslam_torch.frontend.depth_network import DepthNetwork, open_depth, weights_path
