@@ -15,7 +15,7 @@ _HOMES = {
     "folder": "Existing OutFolder out_folder",
     "result": "TrainingResult",
     "processes.distributed": "process_group rank world",
-    "recipe": "DivergedError NonFiniteLossError Validation train",
+    "loop": "DivergedError NonFiniteLossError Validation train",
     "self_supervised": "SelfSupervised SelfSupervisedWeights",
     "signals": "Signal Slot Source Supervised SupervisedWeights",
     "validate": "DepthScores image_tensor predict_metres score",

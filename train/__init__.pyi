@@ -6,13 +6,13 @@ from edgeslam_torch.train.folder import out_folder as out_folder
 from edgeslam_torch.train.hooks import Drawn as Drawn
 from edgeslam_torch.train.hooks import Hooks as Hooks
 from edgeslam_torch.train.hooks import named_hooks as named_hooks
+from edgeslam_torch.train.loop import DivergedError as DivergedError
+from edgeslam_torch.train.loop import NonFiniteLossError as NonFiniteLossError
+from edgeslam_torch.train.loop import Validation as Validation
+from edgeslam_torch.train.loop import train as train
 from edgeslam_torch.train.processes.distributed import process_group as process_group
 from edgeslam_torch.train.processes.distributed import rank as rank
 from edgeslam_torch.train.processes.distributed import world as world
-from edgeslam_torch.train.recipe import DivergedError as DivergedError
-from edgeslam_torch.train.recipe import NonFiniteLossError as NonFiniteLossError
-from edgeslam_torch.train.recipe import Validation as Validation
-from edgeslam_torch.train.recipe import train as train
 from edgeslam_torch.train.recipes.finetune import Data as Data
 from edgeslam_torch.train.recipes.finetune import FromRuns as FromRuns
 from edgeslam_torch.train.recipes.finetune import finetune as finetune

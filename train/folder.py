@@ -16,8 +16,8 @@ from edgeslam_torch import __version__
 from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.train.inputs import NOT_COMPARED, Inputs, given_from_json
+from edgeslam_torch.train.loop import BEST, CURVE, FINAL, LAST
 from edgeslam_torch.train.processes.distributed import by_first, rank, world
-from edgeslam_torch.train.recipe import BEST, CURVE, FINAL, LAST
 from edgeslam_torch.train.result import TrainingResult
 from edgeslam_torch.train.state import saved_step
 from edgeslam_torch.writers.own_folder import FolderLock, check_free

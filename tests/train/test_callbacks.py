@@ -11,7 +11,7 @@ from tensorboard.summary.writer import event_file_writer
 
 from edgeslam_torch.train.callbacks import ProgressBar, TensorBoard
 from edgeslam_torch.train.hooks import Hooks
-from edgeslam_torch.train.recipe import train
+from edgeslam_torch.train.loop import train
 from edgeslam_torch.train.signals import Source, Supervised
 from edgeslam_torch.train.state import TrainConfig
 from edgeslam_torch.train.views.augment import View

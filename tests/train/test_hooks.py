@@ -161,28 +161,18 @@ def test_hooks_are_found_in_files_and_modules(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("Mine", "write MODULE:NAME"),
-        ("hooks.py:", "write MODULE:NAME"),
-        ("nothing.py:Mine", "nothing.py: no such file"),
-        ("no.such.module:Mine", "no.such.module cannot be imported .ModuleNotFoundError: No module named 'no'."),
-        ("broken.py:Mine", "broken.py cannot be imported .ZeroDivisionError"),
-        ("good.py:Other", "good.py has no Other"),
-        ("good.py:Needs", "cannot be made without arguments .TypeError.*; name an instance instead"),
-        ("good.py:number", "is no edgeslam_torch.train.Hooks"),
-    ],
+    "name",
+    ["Mine", "hooks.py:", "nothing.py:Mine", "no.such.module:Mine", "broken.py:Mine", "good.py:Other", "good.py:Needs"]
+    + ["good.py:number"],
 )
-def test_hook_that_is_none_is_an_error_of_one_line(tmp_path, monkeypatch, name, words):
+def test_hook_that_is_none_is_an_error_of_one_line(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     Path("broken.py").write_text("1 / 0")
     Path("good.py").write_text(
         "from edgeslam_torch.train import Hooks\nnumber = 3\nclass Needs(Hooks):\n    def __init__(self, word): pass\n"
     )
-    with pytest.raises(ConfigError, match=words) as error:
+    with pytest.raises(ConfigError, match=f"^--hook {name}: [^\n]*$"):
         named_hooks([name])
-    assert "\n" not in str(error.value)
-    assert str(error.value).startswith(f"--hook {name}: ")
 
 
 def test_examples_do_what_they_say(tmp_path, monkeypatch):

@@ -24,8 +24,8 @@ from edgeslam_torch.train.callbacks import ProgressBar, curves
 from edgeslam_torch.train.folder import TEACHER, TENSORBOARD, WEIGHTS, OutFolder
 from edgeslam_torch.train.hooks import Hooks, changes_losses
 from edgeslam_torch.train.inputs import HOOKS, Inputs, labelled_set, posed_set, weights_name
+from edgeslam_torch.train.loop import BEST, FINAL, train
 from edgeslam_torch.train.processes.distributed import by_first, rank
-from edgeslam_torch.train.recipe import BEST, FINAL, train
 from edgeslam_torch.train.result import TrainingResult
 from edgeslam_torch.train.self_supervised import SelfSupervised
 from edgeslam_torch.train.signals import Signal, Source, Supervised, Views

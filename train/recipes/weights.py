@@ -29,7 +29,7 @@ from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
 from edgeslam_torch.train.callbacks import ProgressBar
-from edgeslam_torch.train.recipe import FINAL, train
+from edgeslam_torch.train.loop import FINAL, train
 from edgeslam_torch.train.recipes.rendered_views import is_worth_learning, render_files, render_rooms, stored_views
 from edgeslam_torch.train.signals import Source, Supervised, SupervisedWeights
 from edgeslam_torch.train.state import TrainConfig

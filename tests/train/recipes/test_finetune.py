@@ -19,7 +19,7 @@ from edgeslam_torch import cli
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import Widths
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train import recipe
+from edgeslam_torch.train import loop
 from edgeslam_torch.train.callbacks import ProgressBar
 from edgeslam_torch.train.state import saved_step
 from edgeslam_torch.writers.own_folder import FolderLock
@@ -311,10 +311,10 @@ def test_hooks_of_the_command_line_take_part(finetune, tmp_path):
         "class Stop(Hooks):\n"
         "    def on_step(self, state, losses):\n        state.stop = 'enough'\n"
     )
-    refused(finetune("kitchen", "--hook", f"{hooks}:Other"), "has no Other")
+    refused(finetune("kitchen", "--hook", f"{hooks}:Other"), "--hook")
     assert not (tmp_path / "out").exists()
     code, _, _ = finetune("kitchen", "--hook", f"{hooks}:Stop")
     assert code == 0
-    assert saved_step(tmp_path / "out" / recipe.LAST) == 1
+    assert saved_step(tmp_path / "out" / loop.LAST) == 1
     record = json.loads((tmp_path / "out" / "finetune.json").read_text())
     assert record["given"]["settings"]["hooks"] == ["hooks_of_a_user:Stop"]

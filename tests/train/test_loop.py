@@ -1,4 +1,4 @@
-"""The recipe: exact resume, one-batch overfit, named failures, several processes."""
+"""The loop: exact resume, one-batch overfit, named failures, several processes."""
 
 import errno
 import os
@@ -20,12 +20,12 @@ from edgeslam_torch.errors import ConfigError, SourceError, WeightsError
 from edgeslam_torch.models.checkpoint import build_network
 from edgeslam_torch.models.fastdepth import Variant, Widths
 from edgeslam_torch.models.weights_file import read_header
-from edgeslam_torch.train import recipe
+from edgeslam_torch.train import loop
 from edgeslam_torch.train import state as state_file
 from edgeslam_torch.train.hooks import Hooks
+from edgeslam_torch.train.loop import DivergedError, NonFiniteLossError, learning_rate_factor, train
 from edgeslam_torch.train.processes.device import Arithmetic
 from edgeslam_torch.train.processes.loading import WorkerError
-from edgeslam_torch.train.recipe import DivergedError, NonFiniteLossError, learning_rate_factor, train
 from edgeslam_torch.train.signals import Slot, Source, Supervised, SupervisedWeights
 from edgeslam_torch.train.state import TrainConfig, saved_step
 from edgeslam_torch.train.validate import image_tensor
@@ -489,7 +489,7 @@ def test_training_on_a_gpu_goes_on_anywhere(tmp_path, device, amp):
 def test_float16_leaves_out_steps_that_overflow(tmp_path, monkeypatch):
     """The first scale, 65536, is too large for these losses; the scaler halves it until it fits."""
     half = Arithmetic(torch.device("cpu"), torch.float16)
-    monkeypatch.setattr(recipe, "arithmetic", lambda device, amp: half)
+    monkeypatch.setattr(loop, "arithmetic", lambda device, amp: half)
     monkeypatch.setattr(Arithmetic, "scaler", lambda self: torch.amp.GradScaler("cpu", init_scale=2.0**40))
     scales = []
 
