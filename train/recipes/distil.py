@@ -29,7 +29,7 @@ from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.layout import Variant
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
-from edgeslam_torch.train.folder import TEACHER, OutFolder
+from edgeslam_torch.train.folder import OutFolder
 from edgeslam_torch.train.hooks import Hooks
 from edgeslam_torch.train.inputs import posed_set
 from edgeslam_torch.train.processes.distributed import rank, world
@@ -66,7 +66,7 @@ def distil(
         ConfigError: If neither the teacher nor a run gives metres; and as `finetune`.
         SourceError: As `label` and `finetune`.
     """
-    root, sha256 = cache or subfolder(out.path, TEACHER), file_hash(teacher.weights)
+    root, sha256 = cache or subfolder(out.path, "labels"), file_hash(teacher.weights)
     data = Data(validation=list(validation))
     for run in runs:
         if not (teacher.is_metric or run.metric):
