@@ -238,7 +238,7 @@ class TelemetryScale:
         for _ in range(_MOST_ROUNDS):
             lost = shown.velocity.lost(shown.ends_s, scale, step, rounding)
             whole = reported + lost[len(intervals) :] - lost[: len(intervals)]
-            evidence = self._evidence(intervals, whole, self._aged(intervals.to_s))
+            evidence = _evidence(intervals, whole, self._R_w_m, tilt, self._aged(intervals.to_s))
             alone = None if evidence is None else evidence.solved(tilt)
             if evidence is None or alone is None:
                 return None
@@ -251,19 +251,6 @@ class TelemetryScale:
                 break
             scale *= 1.0 + float(np.clip(change, -_MOST_CHANGE, _MOST_CHANGE))
         return softened
-
-    def _evidence(self, moved: Displacements, moved_m: FloatArray, aged: FloatArray | None) -> Evidence | None:
-        return displacement_evidence(
-            moved.moved @ self._R_w_m.T,
-            moved_m,
-            moved.from_s,
-            moved.duration_s,
-            moved.sigma,
-            VELOCITY_M_S * np.sqrt(0.1 * moved.duration_s),
-            moved.R_to - moved.R_from,
-            self._tilt_rad,
-            aged,
-        )
 
     def _aged(self, stamps_s: FloatArray) -> FloatArray | None:
         """Log age of the map since each time ``(N,)`` of telemetry's clock, see `aged_since`; None if drift is not
@@ -363,6 +350,27 @@ class TelemetryScale:
         self._trust.judge(reading, agreement(seen, reported, least / scale, least))
 
 
+def _evidence(
+    moved: Displacements,
+    moved_m: FloatArray,
+    R_w_m: FloatArray,
+    tilt_rad: float | FloatArray,
+    aged: FloatArray | None = None,
+) -> Evidence | None:
+    """Evidence from visual displacements and telemetry's ``(N, 3)`` [m], by the noise of its velocities."""
+    return displacement_evidence(
+        moved.moved @ R_w_m.T,
+        moved_m,
+        moved.from_s,
+        moved.duration_s,
+        moved.sigma,
+        VELOCITY_M_S * np.sqrt(0.1 * moved.duration_s),
+        moved.R_to - moved.R_from,
+        tilt_rad,
+        aged,
+    )
+
+
 def scale_of(
     moved: Displacements,
     track: TelemetryTrack,
@@ -389,18 +397,8 @@ def scale_of(
     reported = camera_moved(moved, track, T_b_c[:3, 3], shortfall_m_s)
     moving = np.linalg.norm(reported, axis=1) > MIN_SPEED_M_S * moved.duration_s
     moved, reported = moved.only(moving), reported[moving]
-    sigma_m = VELOCITY_M_S * np.sqrt(0.1 * moved.duration_s)
     tilt = MOUNT_RAD
-    evidence = displacement_evidence(
-        moved.moved @ R_w_m.T,
-        reported,
-        moved.from_s,
-        moved.duration_s,
-        moved.sigma,
-        sigma_m,
-        moved.R_to - moved.R_from,
-        tilt,
-    )
+    evidence = _evidence(moved, reported, R_w_m, tilt)
     found = None if evidence is None else evidence.belief("telemetry", tilt, 0.0)
     if found is None or found.sigma > _MOST_LOCAL_SIGMA:
         return None
