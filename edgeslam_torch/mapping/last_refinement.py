@@ -1,6 +1,5 @@
 """Refinement of the whole map after the last keyframe, with edges and corners."""
 
-import math
 from dataclasses import replace
 
 from edgeslam_torch.config import WindowConfig
@@ -29,15 +28,15 @@ stiff modes never corrects (docs/decisions/12-solver.md)."""
 
 def lm_config(config: WindowConfig) -> LmConfig:
     """Solver settings of every refinement of the map."""
-    robust = LmConfig(
+    return LmConfig(
         solver=config.solver,
         diagnostics=False,
         max_iterations=0 if config.reprojection == "off" else ITERATIONS,
         mu=MU,
         cost_tolerance=COST_TOLERANCE,
         pose_tolerance=POSE_TOLERANCE,
+        robust=config.reprojection != "literal",
     )
-    return replace(robust, delta=math.inf, edge_delta=math.inf) if config.reprojection == "literal" else robust
 
 
 def last_refinement(

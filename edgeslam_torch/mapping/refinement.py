@@ -190,7 +190,7 @@ def window_problem(
     """A window's poses, anchors and observations, and the observations' keypoints of each keyframe.
 
     Poses come free ones first, those of hosts outside the window last. With plain squares (the paper's literal form,
-    an infinite ``delta``) keypoints have equal weight; otherwise they are whitened by octave or alignment.
+    not ``robust``) keypoints have equal weight; otherwise they are whitened by octave or alignment.
     """
     keyframes = [*window.free, *window.fixed]
     row_of_anchor = np.full(len(slam_map.anchors.alive) + 1, -1, dtype=np.int64)
@@ -225,7 +225,7 @@ def window_problem(
         obs_pose=np.concatenate(pose),
         obs_anchor=row,
         uv=uv.astype(np.float64),
-        inv_sigma=np.ones(len(row)) if math.isinf(config.delta) else 1.0 / sigma_px,
+        inv_sigma=1.0 / sigma_px if config.robust else np.ones(len(row)),
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
         relative_priors=motions,
         scale_priors=() if extent is None else (extent,),

@@ -4,6 +4,7 @@ Each kind turns a state into `Normal` equations. Derivatives of hosted blocks ar
 target; the adjoint transforms them to the two poses: ``xi_relative = xi_target - Ad(T_target_host) xi_host``.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.robust_statistics import CHI2_1DOF_95, CHI2_2DOF_95
 from edgeslam_torch.optim.kernels import edges as edge_kernel
 from edgeslam_torch.optim.kernels.normal_equations import accumulate, coupled
 from edgeslam_torch.optim.kernels.reprojection import stepped
@@ -20,6 +22,8 @@ from edgeslam_torch.types import FloatArray, IntArray
 Value = TypeVar("Value", bound=np.generic)
 INVERSE_DEPTH_MIN = 1e-4
 """Lower bound of refined inverse depths: practically at infinity, never behind the camera [1/map unit]."""
+POINT_DELTA, LINE_DELTA = CHI2_2DOF_95**0.5, CHI2_1DOF_95**0.5
+"""Thresholds of Huber's kernel [standard deviations] of pixels, and of the rows of edges and junctions, scalars."""
 _NO_PRIORS = DepthPriors(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
 
 
@@ -102,16 +106,17 @@ class Anchors:
     def normal(self, T_c_w: FloatArray, x: FloatArray, H: FloatArray, g: FloatArray) -> Normal:
         """See `Blocks`."""
         config, seen, known = self.config, self.seen, self.known
+        delta = POINT_DELTA if config.robust else math.inf
         V, g_x, W = np.zeros((len(x), 3, 3)), np.zeros(x.shape), np.zeros((len(self.links.column), 3, 6))
         own = np.zeros((self.free, 6, 6))
         to = (V, g_x, own, g.reshape(-1, 6), W)
         r, J, front = self.rows.reprojection(T_c_w, x, seen.pose, seen.anchor, self.uv, seen.inv_sigma, self.K)
         far = np.square(config.behind_px * seen.inv_sigma)
-        cost = accumulate(r, J, front, far, True, config.delta, seen.anchor, seen.column, self.slots[0], *to)
+        cost = accumulate(r, J, front, far, True, delta, seen.anchor, seen.column, self.slots[0], *to)
         if len(known.pose):
             r_known, J, f = self.rows.inverse_depth(T_c_w, x, known.pose, known.anchor, self.prior, known.inv_sigma)
             far = np.square(config.behind_px * known.inv_sigma)
-            cost += accumulate(r_known, J, f, far, True, config.delta, known.anchor, known.column, self.slots[1], *to)
+            cost += accumulate(r_known, J, f, far, True, delta, known.anchor, known.column, self.slots[1], *to)
         poses = np.arange(self.free)
         add_blocks(H, poses, poses, own)
         return Normal(V, g_x, W, cost, (r, front), self.order)
@@ -195,7 +200,8 @@ class Hosted:
         pairs, views, m = len(self.pairs), len(T_j_i), x.shape[1]
         relative, own, g_view = np.zeros((pairs, m, 6)), np.zeros((views, 6, 6)), np.zeros((views, 6))
         to = (V, g_x, own, g_view, relative)
-        cost += accumulate(r, J, front, self.far, False, self.config.edge_delta, self.block, self.view, self.pairs, *to)
+        delta = LINE_DELTA if self.config.robust else math.inf
+        cost += accumulate(r, J, front, self.far, False, delta, self.block, self.view, self.pairs, *to)
         Ad = se3.adjoint(T_j_i)
         W = np.zeros((len(self.links.column), m, 6))
         coupled(relative, Ad, self.block, self.view, self.target_slot, self.host_slot, W)

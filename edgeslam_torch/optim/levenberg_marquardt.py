@@ -6,9 +6,13 @@ from typing import Generic, Protocol, TypeVar
 
 from edgeslam_torch.optim.problem import LmConfig, StopReason
 
-_MU_MIN = 1e-12
+_MU_MIN, _MU_MAX = 1e-12, 1e8
 _MU_FREE = 1e-6
 """Damping up to which a short step of the poses means that they are at the minimum: more may hold them."""
+_LEAST_STEP = 1e-9
+"""Largest tangent component below which a step is the last."""
+_LEAST_GRADIENT = 1e-9
+"""Largest gradient component, scaled by its curvature, below which the solver stops."""
 
 S = TypeVar("S")
 
@@ -83,7 +87,7 @@ def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[L
 
     if not (math.isfinite(first) and math.isfinite(system.gradient)):
         return ended(StopReason.NOT_FINITE)
-    if system.gradient < config.gradient_tolerance:
+    if system.gradient < _LEAST_GRADIENT:
         return ended(StopReason.GRADIENT_CONVERGED)
     solved = False
     lengths: list[float] = []
@@ -92,7 +96,7 @@ def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[L
         step = problem.propose(system, mu)
         if step is not None:
             solved = True
-            if step.size < config.step_tolerance:
+            if step.size < _LEAST_STEP:
                 return ended(StopReason.STEP_CONVERGED)
             trial = problem.linearise(step.state)
             decrease = system.cost - trial.cost
@@ -111,14 +115,14 @@ def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[L
                     return ended(StopReason.STEP_CONVERGED)
                 if not math.isfinite(system.gradient):
                     return ended(StopReason.NOT_FINITE)
-                if system.gradient < config.gradient_tolerance:
+                if system.gradient < _LEAST_GRADIENT:
                     return ended(StopReason.GRADIENT_CONVERGED)
                 continue
             if abs(decrease) <= 1e-12 * system.cost and math.isfinite(trial.cost):
                 return ended(StopReason.COST_CONVERGED)  # the minimum, up to rounding
         mu *= nu
         nu *= 2.0
-        if mu > config.mu_max:
+        if mu > _MU_MAX:
             return ended(StopReason.STALLED if solved else StopReason.SINGULAR)
     return ended(StopReason.MAX_ITERATIONS)
 

@@ -11,6 +11,14 @@ from edgeslam_torch.optim.kernels.pose import refined
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray
 
+MIN_POINTS = 6
+_MIN_DEPTH = 1e-3
+"""Depth of a point [map units] below which it counts as behind the camera."""
+_MAX_CONDITION = 1e12
+"""Condition number of the scaled normal matrix above which the pose is degenerate."""
+_LEAST_STEP = 1e-6
+"""Largest tangent component below which a round ends."""
+
 
 class PoseStatus(StrEnum):
     """Status of a refined pose."""
@@ -34,14 +42,8 @@ class PoseConfig:
     """Steps per round."""
     chi2: float = CHI2_2DOF_95
     """Squared whitened residual above which a point is an outlier."""
-    step_tolerance: float = 1e-6
-    """Largest tangent component below which a round ends."""
     cost_tolerance: float = 1e-4
     """Relative decrease of the cost below which a round ends."""
-    min_points: int = 6
-    min_depth: float = 1e-3
-    condition_max: float = 1e12
-    """Condition number of the scaled normal matrix above which the pose is degenerate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +104,7 @@ def refine_pose(
     points, n = _floats(p_w).reshape(-1, 3), len(uv)
     if len(points) != n or len(inv_sigma) != n:
         raise ValueError(f"{len(points)} points, {n} pixels and {len(inv_sigma)} sigmas must be equally many")
-    if n < config.min_points:
+    if n < MIN_POINTS:
         return _failed(start, n, PoseStatus.FEW_POINTS)
     if not all(bool(np.isfinite(x).all()) for x in (start, points, uv, inv_sigma)):
         return _failed(start, n, PoseStatus.NOT_FINITE)
@@ -116,17 +118,17 @@ def refine_pose(
         known,
         (config.rounds, config.robust_rounds, config.iterations),
         config.chi2,
-        (config.step_tolerance, config.cost_tolerance),
-        config.min_depth,
-        config.min_points,
+        (_LEAST_STEP, config.cost_tolerance),
+        _MIN_DEPTH,
+        MIN_POINTS,
     )
-    if count < config.min_points:
+    if count < MIN_POINTS:
         return _failed(start, n, PoseStatus.FEW_POINTS, iterations)
     if not np.isfinite(H).all():
         return _failed(start, n, PoseStatus.NOT_FINITE, iterations)
     scale = 1.0 / np.sqrt(np.maximum(H.diagonal(), 1e-30))
     values, vectors = np.linalg.eigh(scale[:, None] * H * scale)
-    if values[0] <= values[-1] / config.condition_max:
+    if values[0] <= values[-1] / _MAX_CONDITION:
         return _failed(start, n, PoseStatus.DEGENERATE, iterations)
     half = scale[:, None] * vectors / np.sqrt(values)
     return PoseResult(

@@ -8,7 +8,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.geometry.robust_statistics import CHI2_1DOF_95, CHI2_2DOF_95
 from edgeslam_torch.types import FloatArray, IntArray
 
 
@@ -225,21 +224,14 @@ class LmConfig:
 
     max_iterations: int = 10
     """Maximum number of steps, accepted or not."""
-    delta: float = CHI2_2DOF_95**0.5
-    """Threshold of Huber's kernel [standard deviations]; infinite for plain squares."""
-    edge_delta: float = CHI2_1DOF_95**0.5
-    """The same for edge and junction rows, which are scalars."""
+    robust: bool = True
+    """Huber's kernel; otherwise plain squares, the paper's form."""
     mu: float = 1e-4
     """Initial damping, relative to the diagonal of the normal matrix."""
-    mu_max: float = 1e8
     cost_tolerance: float = 1e-5
     """Relative decrease of the cost below which an accepted step is the last."""
     pose_tolerance: float = 0.0
     """Expected distance of the poses to the minimum [standard deviations, all poses together] that ends the search."""
-    step_tolerance: float = 1e-9
-    """Largest tangent component below which a step is the last."""
-    gradient_tolerance: float = 1e-9
-    """Largest gradient component, scaled by its curvature, below which the solver stops."""
     behind_px: float = 1000.0
     """Residual of an observation behind the camera, and upper limit of all residuals."""
     solver: str = "compiled"
@@ -249,16 +241,14 @@ class LmConfig:
     """Report the losses of the result."""
     diagnostics: bool = True
     """Report rank deficiency and the newest pose's covariance (costs one more linearisation)."""
-    rank_tolerance: float = 1e-9
-    """Eigenvalues of the scaled reduced system below this fraction of the largest count as zero."""
 
     def __post_init__(self) -> None:
         if self.max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, got {self.max_iterations}")
         if self.solver not in ("compiled", "modules"):
             raise ValueError(f"solver must be compiled or modules, got {self.solver!r}")
-        if self.delta <= 0 or self.mu <= 0:
-            raise ValueError(f"delta and mu must be positive, got {self.delta} and {self.mu}")
+        if self.mu <= 0:
+            raise ValueError(f"mu must be positive, got {self.mu}")
 
 
 @dataclass(frozen=True, slots=True)

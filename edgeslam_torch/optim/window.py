@@ -16,6 +16,8 @@ from edgeslam_torch.optim.problem import LmConfig, Rows, StopReason, WindowProbl
 from edgeslam_torch.types import FloatArray
 
 _FLOOR = 1e-30
+_ZERO = 1e-9
+"""Eigenvalues of the scaled reduced system below this fraction of the largest count as zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +144,7 @@ class Window:
         S, *_ = self._reduce(system, 0.0)
         scale = (system.H.diagonal() + _FLOOR) ** -0.5
         values, vectors = np.linalg.eigh(scale[:, None] * S * scale, "U")
-        good = values > self.config.rank_tolerance * max(values[-1], _FLOOR)
+        good = values > _ZERO * max(values[-1], _FLOOR)
         rows = vectors[-6:, good]
         covariance = (rows / values[good]) @ rows.T * scale[-6:, None] * scale[-6:]
         return int((~good).sum()), covariance

@@ -17,7 +17,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
-from edgeslam_torch.optim.pose_only import PoseConfig, PoseResult, refine_pose
+from edgeslam_torch.optim.pose_only import MIN_POINTS, PoseConfig, PoseResult, refine_pose
 from edgeslam_torch.tracking.pose_prior import TrackingPrior
 from edgeslam_torch.types import FloatArray, IntArray
 
@@ -125,7 +125,7 @@ class EdgeTracker:
         count = len(points.uv)
         for reach in REACH_PX:
             edges, _ = self._match(seen, known, T_c_w, reach)
-            if count + len(edges.uv) < EFFORT.min_points:
+            if count + len(edges.uv) < MIN_POINTS:
                 return None
             result = self._solve(T_c_w, points, edges, expected)
             T_c_w = result.T_c_w

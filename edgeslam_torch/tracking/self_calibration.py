@@ -24,6 +24,7 @@ from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, Camera
 from edgeslam_torch.geometry.robust_statistics import robust_sigma
 from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.optim.blocks import POINT_DELTA
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, ScalePrior, WindowProblem, WindowResult
 from edgeslam_torch.types import FloatArray, IntArray
@@ -228,7 +229,7 @@ def _slope(problem: WindowProblem, camera: Camera, log_scale: float) -> float:
     p_c, uv, inv_sigma = p_c[front], problem.uv[front], problem.inv_sigma[front, None]
     from_centre = scale * np.array([camera.fx, camera.fy]) * p_c[:, :2] / p_c[:, 2:]
     r = (from_centre + [camera.cx, camera.cy] - uv) * inv_sigma
-    weight = np.minimum(1.0, _REFINEMENT.delta / np.maximum(np.linalg.norm(r, axis=1), 1e-12))  # Huber's
+    weight = np.minimum(1.0, POINT_DELTA / np.maximum(np.linalg.norm(r, axis=1), 1e-12))  # Huber's
     return float(2.0 * (weight[:, None] * r * from_centre * inv_sigma).sum())
 
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms, LmConfig, WindowProblem
+from edgeslam_torch.optim.blocks import POINT_DELTA
+from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms, WindowProblem
 from edgeslam_torch.types import FloatArray, IntArray
 
 K = (525.0, 525.0, 319.5, 239.5)
@@ -205,7 +206,7 @@ def refine_with_gtsam(problem: WindowProblem, iterations: int) -> tuple[float, f
     held = gtsam.noiseModel.Isotropic.Sigma(6, 1e-7)
     fx, fy, cx, cy = problem.K
     calibration = gtsam.Cal3_S2(fx, fy, 0.0, cx, cy)
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(LmConfig().delta)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(POINT_DELTA)
     noises = {
         s: gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, 1.0 / s))
         for s in np.unique(problem.inv_sigma)

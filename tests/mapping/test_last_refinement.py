@@ -138,8 +138,8 @@ def test_the_last_refinement_uses_the_full_weight_of_telemetry(monkeypatch):
 
 
 def test_forms_of_the_terms_in_flight():
-    assert np.isfinite(lm_config(WindowConfig()).delta)
-    assert np.isinf(lm_config(WindowConfig(reprojection="literal")).delta)
+    assert lm_config(WindowConfig()).robust
+    assert not lm_config(WindowConfig(reprojection="literal")).robust
     assert lm_config(WindowConfig(reprojection="off")).max_iterations == 0
 
 

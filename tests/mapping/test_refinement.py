@@ -71,13 +71,13 @@ def test_a_window_that_cannot_be_refined_is_unchanged(points, what):
     check_map(points.map)
 
 
-@pytest.mark.parametrize(("delta", "sigma_px"), [(2.4, 1.2**3), (np.inf, 1.0)])
-def test_keypoints_are_weighted_by_their_pyramid_level(points, delta, sigma_px):
+@pytest.mark.parametrize(("robust", "sigma_px"), [(True, 1.2**3), (False, 1.0)])
+def test_keypoints_are_weighted_by_their_pyramid_level(points, robust, sigma_px):
     """A keypoint of level 3 scatters by 1.728 px; in the paper's plain squares all count effective_samples."""
     window = choose_window(points.map, points.keyframes[-1], 4, 15)
     coarse = points.keyframes[-1]
     coarse.features.octave[:] = 3
-    problem, keypoint = window_problem(points.map, window, CAMERA, LmConfig(delta=delta))
+    problem, keypoint = window_problem(points.map, window, CAMERA, LmConfig(robust=robust))
     pose = [*window.free, *window.fixed].index(coarse)
     mine = problem.obs_pose == pose
     assert mine.sum() == len(keypoint[pose]) > 20

@@ -109,7 +109,7 @@ def test_seeing_an_anchor_twice_weighs_double():
     problem = points_only(seeded_window(5, SMALL)).problem
     twice = keep(problem, np.r_[np.arange(len(problem.uv)), 0])
     heavier = replace(problem, inv_sigma=np.where(np.arange(len(problem.uv)) == 0, 2**0.5, 1.0) * problem.inv_sigma)
-    config = replace(TIGHT, delta=np.inf)
+    config = replace(TIGHT, robust=False)
     np.testing.assert_allclose(refine_window(twice, config).T_c_w, refine_window(heavier, config).T_c_w, atol=1e-9)
 
 
@@ -186,7 +186,7 @@ def test_edges_sharpen_the_poses_and_their_own_depths():
 def test_covariance_of_the_newest_pose_matches_its_scatter():
     size = WindowSize(poses=4, fixed=2, anchors=60, observations=200, edges=0, junctions=0)
     window = seeded_window(10, size)
-    config = LmConfig(delta=np.inf, max_iterations=8)
+    config = LmConfig(robust=False, max_iterations=8)
     clean = seeded_window(10, size, CLEAN).problem.uv
     whitened = []
     for seed in range(120):
@@ -218,7 +218,7 @@ def test_the_papers_cycle_alone_shrinks_the_baseline_and_the_full_problem_recove
     size = replace(SMALL, fixed=1, edges=400, pairs=1600)
     window = seeded_window(11, size)
     problem = replace(cycle_alone(window), T_c_w=window.T_c_w)
-    alone = refine_window(problem, replace(TIGHT, max_iterations=200, delta=np.inf))
+    alone = refine_window(problem, replace(TIGHT, max_iterations=200, robust=False))
     true = baselines(window.T_c_w)
     assert alone.cost_after < 1e-3 * alone.cost_before
     assert np.median(baselines(alone.T_c_w) / true) < 0.9

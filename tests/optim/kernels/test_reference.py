@@ -101,14 +101,14 @@ def _terms(problem, config):
         p_c = in_camera(poses(u)[problem.obs_pose], (_t(problem.p_w) + u.anchors)[problem.obs_anchor])
         return (pixel(p_c) - _t(problem.uv)) * _t(problem.inv_sigma)[:, None]
 
-    terms = [(anchors, config.delta)]
+    terms = [(anchors, _delta(config, 5.991))]
     if (known := problem.depth_priors) is not None:
 
         def depths(u):
             p_c = in_camera(poses(u)[known.pose], (_t(problem.p_w) + u.anchors)[known.anchor])
             return ((1.0 / p_c[:, 2] - _t(known.inverse_depth)) / _t(known.sigma))[:, None]
 
-        terms.append((depths, config.delta))
+        terms.append((depths, _delta(config, 5.991)))
     if problem.edges is not None:
         terms += _edge_terms(problem, config, poses, in_camera, pixel)
     if problem.junctions is not None:
@@ -152,10 +152,10 @@ def _edge_terms(problem, config, poses, in_camera, pixel):
         known = np.isfinite(e.prior_sigma)
         return ((depth(u) - _t(e.prior))[known] / _t(e.prior_sigma)[known])[:, None]
 
-    terms = [(alignment, config.edge_delta), (prior, None)]
+    terms = [(alignment, _delta(config, 3.841)), (prior, None)]
     if e.cycle_sigma > 0:
         form = round_trip if e.cycle_px else relative_depth
-        terms.append((form, config.edge_delta))
+        terms.append((form, _delta(config, 3.841)))
     return terms
 
 
@@ -196,7 +196,12 @@ def _junction_terms(problem, config, poses, in_camera, pixel):
     def prior(u):
         return (root @ (depth(u) - _t(c.prior))[..., None])[..., 0]
 
-    return [(corner, config.edge_delta), (angles, config.edge_delta), (prior, None)]
+    return [(corner, _delta(config, 3.841)), (angles, _delta(config, 3.841)), (prior, None)]
+
+
+def _delta(config, chi2_95):
+    """Threshold of Huber's kernel: 95 % of normally distributed residuals."""
+    return chi2_95**0.5 if config.robust else math.inf
 
 
 def _t(x):
@@ -238,7 +243,7 @@ CASES = {
     "anchors alone": (replace(SMALL, edges=0, pairs=0, junctions=0), {}, {}),
     "an anchor seen twice from one pose": (replace(SMALL, edges=0, pairs=0, junctions=0), {}, {"twice": True}),
     "many poses": (LONG, {}, {}),
-    "least squares": (SMALL, {"delta": math.inf, "edge_delta": math.inf}, {}),
+    "least squares": (SMALL, {"robust": False}, {}),
     "cycle in pixels": (SMALL, {}, {"cycle_px": True}),
     "cosines": (SMALL, {}, {"cosines": True}),
 }
