@@ -43,6 +43,10 @@ _ALLOWED = {
     Name("torch._utils", "_rebuild_parameter"),
     # Beside the model (arguments, epoch, best result, optimiser), unused:
     Name("argparse", "Namespace"),
+    Name("pathlib", "PosixPath"),
+    Name("pathlib", "WindowsPath"),
+    Name("torch", "device"),
+    Name("torch.torch_version", "TorchVersion"),
     Name("collections", "defaultdict"),
     Name("builtins", "dict"),
     Name("__builtin__", "dict"),
@@ -260,7 +264,8 @@ def _checkpoint(reader: _ZipReader | _LegacyReader) -> Checkpoint:
         found = {str(name): _as_tensor(value, reader.bytes_of) for name, value in content.items()}
         tensors = {name: tensor for name, tensor in found.items() if tensor is not None}
     if not tensors:
-        raise WeightsError("holds no network")
+        there = f": it holds {', '.join(map(str, content))[:80]}" if isinstance(content, dict) else ""
+        raise WeightsError(f"holds no network, itself or as {', '.join(STATES)}{there}")
     state = {plain_name(name): tensor for name, tensor in tensors.items()}
     return Checkpoint(state, record, isinstance(content, Instance))
 

@@ -84,6 +84,11 @@ def metadata_without_record(state: Mapping[str, HasShape], path: Path) -> Metada
     Raises:
         WeightsError: If they are of another network.
     """
+    if any(name.startswith("uncertainty.") for name in state):
+        raise WeightsError(
+            "weights of a network of ours without its record, which says how to feed it; write them by "
+            "`save_checkpoint(network, metadata, path)`"
+        )
     metadata = replace(upstream_metadata(state), data=(), licence="", notes="no record; fed as the authors' weights")
     logger.warning(
         f"{path}: has no record: taken for FastDepth that gives metres for RGB in [0, 1] at "

@@ -15,6 +15,8 @@ from edgeslam_torch.types import PointCloud
 from edgeslam_torch.writers.ply import read_ply
 from edgeslam_torch.writers.run_summary import vertical_text
 
+_NUMBERS = ("stamp_s", "scale", "scale_sigma", "unit", "revision")
+"""Columns of ``status.csv`` that are read as numbers; empty where a run knows none."""
 _SUPPORTED = frozenset({"initialised", "tracked", "relocalised"})
 """Status of a frame whose pose rests on the map, in tables of version 0.1, which have no column that says so."""
 
@@ -139,15 +141,19 @@ def read_status(path: Path) -> tuple[dict[str, str], ...]:
     """Rows of ``status.csv``; empty when there is none.
 
     Raises:
-        EvaluationError: If it is not a table of text.
+        EvaluationError: If it is not a table of text, or a cell that is a number in every run is none.
     """
     if not path.is_file():
         return ()
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            return tuple({k: v or "" for k, v in row.items() if k is not None} for row in csv.DictReader(file))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise EvaluationError(f"{path}: not a table of text ({error})") from error
+            rows = tuple({k: v or "" for k, v in row.items() if k is not None} for row in csv.DictReader(file))
+        for row in rows:
+            for name in _NUMBERS:
+                float(row.get(name) or "nan")
+    except (ValueError, csv.Error) as error:  # not UTF-8, too
+        raise EvaluationError(f"{path}: not the table of a run ({error})") from error
+    return rows
 
 
 def read_summary(path: Path) -> dict[str, Any]:

@@ -33,6 +33,8 @@ _TIMES = "times.txt"
 _EUROC = ("state_groundtruth_estimate0", "mocap0", "vicon0", "leica0")
 """Folders of an EuRoC or TUM-VI sequence with true poses: of the body, or of a marker that is mounted on it."""
 
+_MAX_LENGTH = 1e12
+"""Larger numbers are no positions: in millimetres, the way to the sun."""
 _TOO_FEW_DIGITS = 0.3
 """Share of rows that repeat a stamp with another position from which the stamps are taken for rounded ones."""
 
@@ -171,12 +173,12 @@ def _from_columns(table: Table, columns: Columns, path: Path) -> Trajectory:
 
 
 def _finite(stamps_s: FloatArray, values: FloatArray, source: str, notes: list[str]) -> tuple[FloatArray, FloatArray]:
-    """Poses, in any form ``(N, ...)``, without those that are not finite."""
-    finite = np.isfinite(values).reshape(len(values), -1).all(axis=1) & np.isfinite(stamps_s)
+    """Poses, in any form ``(N, ...)``, without those that are not finite or of sizes that no length has."""
+    finite = (np.abs(values) <= _MAX_LENGTH).reshape(len(values), -1).all(axis=1) & np.isfinite(stamps_s)
     if not finite.any():
-        raise EvaluationError(f"{source}: every pose holds a NaN or infinity")
+        raise EvaluationError(f"{source}: every pose holds a NaN, an infinity or an absurdly large number")
     if not finite.all():
-        notes.append(f"{np.count_nonzero(~finite)} of {len(values)} poses are not finite and were left out")
+        notes.append(f"{np.count_nonzero(~finite)} of {len(values)} poses are not finite, or absurdly far: left out")
     return stamps_s[finite], values[finite]
 
 

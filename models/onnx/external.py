@@ -127,7 +127,7 @@ def _description(model: onnx.ModelProto, path: Path) -> ExternalNetwork:
     try:
         record = _json(own) if own is not None else read_mapping(beside, "TOML", ConfigError)
         preset = record.pop("preset", None)
-        if preset is not None and preset not in PRESETS:
+        if preset is not None and str(preset) not in PRESETS:
             raise ConfigError(f"no preset {preset!r}; there are {', '.join(PRESETS)}")
         known = {} if preset is None else PRESETS[preset].description
         origin = f"{path}: {PROPERTY}" if own is not None else str(beside)

@@ -82,6 +82,8 @@ def _brought_in(model: onnx.ModelProto, path: Path) -> bool:
         name = entry.get("location", "")
         if Path(name).name != name:
             raise WeightsError(f"its numbers lie in {name!r}, outside the file's folder; save the network as one file")
+        if not (path.parent / name).is_file():
+            raise WeightsError(f"its numbers are to lie in {name!r} beside it, and no such file is there; copy it too")
         with open_weights(path.parent / name) as opened:
             whole = opened.seek(0, os.SEEK_END)
         total += int(entry.get("length", whole))

@@ -1,5 +1,8 @@
 """A run's folder as evaluation reads it."""
 
+import pytest
+
+from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.run_folder import is_supported, open_run
 
 
@@ -14,3 +17,11 @@ def test_rows_are_those_of_the_poses_where_a_run_is_in_pieces(tmp_path):
     assert [is_supported(row) for row in run.pose_rows] == [True, True, True, False]
     assert run.trusted_frames == 3
     assert len(run.status) == 6
+
+
+@pytest.mark.parametrize("row", ["stamp_s,scale", "x,1", "1,x"])
+def test_a_status_table_with_words_for_numbers_is_one_line(tmp_path, row):
+    (tmp_path / "trajectory.txt").write_text("".join(f"{i} {i} 0 0 0 0 0 1\n" for i in range(3)))
+    (tmp_path / "status.csv").write_text(f"stamp_s,scale\n0,\n{row}\n")
+    with pytest.raises(EvaluationError, match=r"status\.csv: not the table of a run"):
+        open_run(tmp_path)

@@ -270,3 +270,14 @@ def test_rows_of_kitti_without_times_take_those_of_as_many_poses(loop, tmp_path)
     np.testing.assert_allclose(on_one_clock(loop, rows)[1].stamps_s, loop.stamps_s)
     with pytest.raises(EvaluationError, match=r"times\.txt"):
         on_one_clock(rows, loop.take(slice(0, 150)))
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "1e200", "-1e300"])
+def test_positions_that_are_none_are_left_out(number, tmp_path):
+    path = tmp_path / "t.txt"
+    path.write_text("".join(f"{i} {number if i == 4 else i} 0 0 0 0 0 1\n" for i in range(9)))
+    trajectory = read_trajectory(path)
+    assert trajectory.stamps_s.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
+    path.write_text("".join(f"{i} {number} 0 0 0 0 0 1\n" for i in range(9)))
+    with pytest.raises(EvaluationError, match="every pose"):
+        read_trajectory(path)

@@ -13,7 +13,7 @@ from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.frontend.depth_network import DepthPredictor
 from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
 from edgeslam_torch.models.layout import Widths
-from edgeslam_torch.models.onnx.file import read_onnx
+from edgeslam_torch.models.onnx.file import parse_onnx, read_onnx
 from edgeslam_torch.models.onnx.graph import build_graph
 from edgeslam_torch.models.record import Metadata
 
@@ -66,6 +66,17 @@ def test_a_whole_file_is_read(whole, tmp_path):
     (tmp_path / "w.onnx").write_bytes(whole)
     assert read_onnx(tmp_path / "w.onnx") == (whole, METADATA)
     assert DepthPredictor(tmp_path / "w.onnx").metadata == METADATA
+
+
+def test_numbers_beside_the_file_are_read_and_missed_by_name(whole, tmp_path):
+    model = onnx.load_model_from_string(whole)
+    onnx.save(model, str(tmp_path / "w.onnx"), save_as_external_data=True, location="w.data", size_threshold=0)
+    read = {t.name: numpy_helper.to_array(t) for t in parse_onnx(tmp_path / "w.onnx").model.graph.initializer}
+    for tensor in onnx.load_model_from_string(whole).graph.initializer:
+        np.testing.assert_array_equal(read[tensor.name], numpy_helper.to_array(tensor))
+    (tmp_path / "w.data").unlink()
+    with pytest.raises(WeightsError, match=r"w\.onnx: .*w\.data"):
+        parse_onnx(tmp_path / "w.onnx")
 
 
 @pytest.mark.parametrize(
