@@ -1,5 +1,6 @@
 """The command line as a user meets it: every mistake gets one line that says what to do."""
 
+import argparse
 import json
 import logging
 import os
@@ -203,6 +204,9 @@ def test_every_command_has_a_group_and_examples_that_parse():
             assert words[:2] == ["edgeslam", name]
             if name not in ("finetune", "distil"):  # whose weights must exist
                 parser.parse_args(words[1:])
+    (commands,) = (action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    for name, lines in EXAMPLES.items():
+        assert all(line in commands[name].format_help() for line in lines)
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])

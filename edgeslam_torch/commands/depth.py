@@ -30,7 +30,7 @@ _MAX_PROBLEMS_SHOWN = 10
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = FILES
+    parser.epilog = "\n".join(filter(None, (FILES, parser.epilog)))
     parser.add_argument("source", metavar="SOURCE", help="an image, a folder, a recording or a video")
     parser.add_argument("--out", "-o", type=Path, metavar="DIR", required=True, help="folder for the files below")
     parser.add_argument(

@@ -48,6 +48,8 @@ def run_flight(task: dict[str, Any], folder: Path) -> dict[str, Any]:
     result = run(source, work, config)
     if result.interrupted or result.failure is not None:
         raise OutputError(result.failure or "interrupted")
+    if not result.summary["tracked"]:
+        raise OutputError(f"no frame was tracked against a map ({result.summary['last_reason'] or 'no reason known'})")
     truth = task["truth"] or (task["recording"] if source.groundtruth is not None else None)
     score, note = _score(work, truth, task["map_score"])
     write_report(work, truth if score is not None else None, judge_map=task["map_score"])

@@ -4,6 +4,7 @@ import json
 from functools import partial
 
 import bag_files as bags
+import cv2
 import numpy as np
 import pytest
 from fake_slam import FakeSlam
@@ -49,6 +50,15 @@ def write_truth(path, scale=2.0):
     """The stub's path, `scale` times as long."""
     lines = [f"{100 + 0.1 * i:.6f} {scale * 0.01 * i} {0.001 * i * i} 1 0 0 0 1" for i in range(FRAMES)]
     path.write_text("\n".join(lines) + "\n")
+
+
+def test_a_flight_that_tracked_nothing_has_failed(tmp_path, flown, write_tum):
+    recording = write_tum(tmp_path / "rec", FRAMES)
+    for path in (recording / "rgb").iterdir():
+        cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path))))
+    folder, task, code = flown(recording)
+    assert code != 0
+    assert not (folder.path / "flights" / "one").exists()
 
 
 def test_finished_flight_is_a_run_folder_with_report_picture_and_result(tmp_path, flown, write_tum):
