@@ -90,8 +90,6 @@ def test_a_folder_is_no_file(tmp_path):
         "eval IN -g IN --json FILE",
         "eval IN -g IN --markdown FILE",
         "eval IN -g IN --json FILE --overwrite",
-        "eval IN -g IN --convert tum FILE",
-        "eval IN -g IN --convert tum FILE --overwrite",
         "compare IN IN -g IN --json FILE",
         "calibrate IN --out FILE",
         "export --out FILE",
