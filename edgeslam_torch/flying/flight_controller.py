@@ -62,7 +62,7 @@ class FlightController:
         self._witness = witness
         self._lock = threading.Lock()
         self._next: Skill | None = None
-        self._hold = False
+        self._hold, self._land_because = False, ""
         self._contact: Contact | None = None
         """Contact since the last planning cycle."""
         self._track = Places()
@@ -82,6 +82,10 @@ class FlightController:
     def hold(self, hold: bool) -> None:
         """Hover, overriding the planner, until released; for an operator at the keyboard."""
         self._hold = hold
+
+    def land(self, why: str) -> None:
+        """Land instead of following the planner, and return at once; callable from a signal handler."""
+        self._land_because = self._land_because or why
 
     def feel(self, contact: Contact) -> None:
         """Pass an unseen obstacle to the planner's next cycle."""
@@ -116,6 +120,7 @@ class FlightController:
         with self._lock:
             self._supervisor.see(state)
             self._supervisor.hold = self._hold
+            self._supervisor.landing = self._supervisor.landing or self._land_because
             order = self._supervisor.order(state.stamp_s)
         if order.contact is not None:
             self.feel(order.contact)

@@ -42,7 +42,6 @@ class LockstepVehicle:
         self.tello = tello or LockstepTello(drone, paint, seed=site.seed)
         self.over = ""
         self.flying = False
-        self._land_because: str | None = None
         self.battery = math.nan
         self._flight_controller = flight_controller
         self._perception = SlamPerception(self.camera, site.seed)
@@ -63,35 +62,26 @@ class LockstepVehicle:
     def fly(self, until: Callable[[], bool]) -> None:
         """As `Vehicle`."""
         while self.flying and not until():
-            if self._land_because is not None:
-                self.land(self._land_because)
-                return
             self._tick()
             state = self._perception.state(self.tello.clock_s, self._view)
             self._view = None
             self._flight_controller.plan(state)
             order = self._flight_controller.order(state)
             if order.land:
-                self.land(str(order.danger))
+                self._land(order.command.why)
             else:
                 right, forward, up, clockwise = (round(100 * v) for v in order.command.sticks())
                 self.tello.send(f"rc {right} {forward} {up} {clockwise}")
 
-    def land(self, why: str) -> None:
-        """As `Vehicle`."""
-        if self.flying:
-            self.flying, self.over = False, why
-            self._ask("land")
-
-    def stop(self, why: str) -> None:
-        """As `Vehicle`."""
-        if self.flying:
-            self._land_because = why
-
     def close(self) -> None:
         """As `Vehicle`."""
-        self.land("the program left")
+        if self.flying:
+            self._land("the program left")
         self._perception.close()
+
+    def _land(self, why: str) -> None:
+        self.flying, self.over = False, why
+        self._ask("land")
 
     def _tick(self) -> list[Event]:
         events = self.tello.advance(TICK_S)

@@ -213,8 +213,7 @@ class Navigator:
         if result is None:
             result = Result(False, HOME_BECAUSE)
             self.return_home()
-            if self.vehicle.flying:
-                self.vehicle.land(HOME_BECAUSE)
+            self._land(HOME_BECAUSE)
         reason = result.reason + self._rests_on() if result.reached else result.reason
         return FlightResult(result.reached, reason, clearance_m, path_m)
 
@@ -227,8 +226,12 @@ class Navigator:
         if not self.vehicle.flying:
             raise FlightRefused(f"not flying{f': {self.vehicle.over}' if self.vehicle.over else ''}")
         path_m, clearance_m = self.flight_controller.flown()
-        self.vehicle.land("as commanded")
+        self._land("as commanded")
         return FlightResult(self.vehicle.over == "as commanded", f"landed: {self.vehicle.over}", clearance_m, path_m)
+
+    def _land(self, why: str) -> None:
+        self.flight_controller.land(why)
+        self.vehicle.fly(lambda: False)
 
     def _goal(self, goal_w: Sequence[float] | FloatArray) -> FloatArray:
         goal = check_goal(goal_w, self.limits)

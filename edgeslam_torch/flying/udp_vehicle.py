@@ -63,8 +63,6 @@ class UdpVehicle:
         self.over = ""
         self._flight_controller = flight_controller
         self._flying = threading.Event()
-        self._landed = threading.Event()
-        self._land_because: str | None = None
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
         self._view: View | None = None
@@ -111,7 +109,6 @@ class UdpVehicle:
             TelloError: If the drone does not take off.
         """
         self.tello.take_off()
-        self._landed.clear()
         self._flying.set()
 
     def fly(self, until: Callable[[], bool]) -> None:
@@ -119,21 +116,12 @@ class UdpVehicle:
         while self.flying and not until():
             self._stopping.wait(_POLL_S)
 
-    def land(self, why: str) -> None:
-        """As `Vehicle`: requests the landing from the supervising thread, which does nothing else from then on."""
-        if self.flying:
-            self.stop(why)
-            self._landed.wait(_LAND_S)
-
-    def stop(self, why: str) -> None:
-        """As `Vehicle`."""
-        if self.flying:
-            self._land_because = self._land_because or why
-
     def close(self) -> None:
         """As `Vehicle`."""
         try:
-            self.land("the program left")
+            self._flight_controller.land("the program left")
+            until_s = self.tello.clock.now() + _LAND_S
+            self.fly(lambda: self.tello.clock.now() > until_s)
         finally:
             self._stopping.set()
             self.tello.close()  # also lands, in case the thread above has died
@@ -161,7 +149,7 @@ class UdpVehicle:
                 if not self._one_size.fits(picture):
                     continue
             except SourceError as error:
-                self.stop(str(error))
+                self._flight_controller.land(str(error))
                 continue
             view = self._perception.seen(picture.image, picture.stamp_s, picture.stamp_s - _VIDEO_DELAY_S)
             if view is not None:
@@ -196,12 +184,9 @@ class UdpVehicle:
 
     def _tick(self) -> None:
         assert self._perception is not None
-        if self._land_because is not None:
-            self._end(self._land_because)
-            return
         order = self._flight_controller.order(self._perception.state(self.tello.clock.now()))
         if order.land:
-            self._end(str(order.danger))
+            self._end(order.command.why)
         else:
             self.tello.rc(*order.command.sticks())
 
@@ -212,6 +197,4 @@ class UdpVehicle:
         except TelloError as error:
             self.over = f"{why}; {error}"
         finally:
-            self._land_because = None
             self._flying.clear()
-            self._landed.set()

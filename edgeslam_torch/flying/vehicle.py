@@ -29,13 +29,7 @@ class Vehicle(Protocol):
         """
 
     def fly(self, until: Callable[[], bool]) -> None:
-        """Run until a condition holds or the flight ends."""
-
-    def land(self, why: str) -> None:
-        """Land and wait until it stands."""
-
-    def stop(self, why: str) -> None:
-        """Request a landing if flying, and return at once; callable from a signal handler."""
+        """Run until a condition holds or the drone has landed, as the flight controller orders."""
 
     def close(self) -> None:
         """Land if flying, and disconnect."""

@@ -3,10 +3,17 @@
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from scipy import ndimage
 
 from edgeslam_torch.types import FloatArray
+
+
+def distance_cells(mask: np.ndarray) -> FloatArray:
+    """Distance of the cells ``(X, Y)`` of a mask to the nearest cell outside it [cells]; 0 outside."""
+    away = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(away, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -24,8 +31,7 @@ class Layer:
     @cached_property
     def clearance_m(self) -> FloatArray:
         """``(X, Y)`` distance [m] of each free cell's centre to the nearest cell that is not free; 0 elsewhere."""
-        padded = np.pad(self.free, 1)
-        away = np.asarray(ndimage.distance_transform_edt(padded))[1:-1, 1:-1]
+        away = distance_cells(np.pad(self.free, 1))[1:-1, 1:-1]
         return np.maximum(away - 0.5, 0.0) * self.cell_m
 
     @cached_property
@@ -33,7 +39,7 @@ class Layer:
         """``(X, Y)`` distance [m] of each cell's centre to the border of the nearest occupied cell."""
         if not self.solid.any():
             return np.full(self.solid.shape, np.inf)
-        return np.maximum(np.asarray(ndimage.distance_transform_edt(~self.solid)) - 0.5, 0.0) * self.cell_m
+        return np.maximum(distance_cells(~self.solid) - 0.5, 0.0) * self.cell_m
 
     def cells(self, p_w: FloatArray) -> np.ndarray:
         """Cells ``(..., 2)`` int of points ``(..., 2)``, clipped to the grid."""

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy import ndimage
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.layer import Layer, distance_cells
 from edgeslam_torch.types import FloatArray
 
 _NEIGHBOURS = ((1, 0), (0, 1), (1, 1), (1, -1))
@@ -90,7 +89,7 @@ def cost_to_go(
     cost = _from(graph, at_goals & open_)
     if np.isfinite(cost[tuple(here)]) or beside_m == 0.0 or not at_goals.any():
         return CostToGo(layer, cost)
-    away = ndimage.distance_transform_edt(~at_goals)
+    away = distance_cells(~at_goals)
     for cells in range(1, round(beside_m / layer.cell_m) + 1):
         cost = _from(graph, open_ & (away <= cells))
         if np.isfinite(cost[tuple(here)]):

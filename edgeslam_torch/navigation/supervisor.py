@@ -96,8 +96,8 @@ class Supervisor:
     limits: NavLimits = field(default_factory=NavLimits)
     views: MapViews = field(default_factory=MapViews)
     """The planner's views of the map."""
-    landing: bool = False
-    """A landing is never aborted."""
+    landing: str = ""
+    """Why it lands, if it does; a landing is never aborted."""
     hold: bool = False
     """Whether the operator requested hovering."""
     _state: DroneState | None = None
@@ -152,8 +152,7 @@ class Supervisor:
         self._sent = danger in (Danger.NONE, Danger.CONTACT) and not self.hold
         home = self._state.battery <= self.limits.home_battery
         if danger is Danger.BATTERY or self.landing:
-            self.landing = True
-            return Order(VelocityCommand(why=str(danger)), land=True, danger=danger)
+            return self._land(danger)
         if self.hold:
             self._since_s = math.nan
             return Order(VelocityCommand(why=str(Danger.HOLD)), danger=Danger.HOLD)
@@ -166,8 +165,7 @@ class Supervisor:
         patience_s = UNSURE_LAND_S if danger in _UNSURE else LAND_S + self._back_s - _BACK_M / _BACK_M_S
         in_vain = trouble_s > patience_s or now_s - self._since_s > UNSURE_LAND_S
         if in_vain or (danger is Danger.CONTACT and trouble_s > BACK_S + self._back_s):
-            self.landing = True
-            return Order(VelocityCommand(why=str(danger)), land=True, danger=danger)
+            return self._land(danger)
         began = danger is Danger.CONTACT and trouble_s == 0.0
         contact = Contact(self._state.p_w.copy(), self._pushed_w(self._command)) if began else None
         command = self._meanwhile(danger, trouble_s)
@@ -176,6 +174,10 @@ class Supervisor:
             contact = Contact(self._state.p_w.copy(), self._pushed_w(command))
             command = VelocityCommand(why=f"{danger}: hover")
         return Order(command, home=home, danger=danger, contact=contact)
+
+    def _land(self, danger: Danger) -> Order:
+        self.landing = self.landing or str(danger)
+        return Order(VelocityCommand(why=self.landing), land=True, danger=danger)
 
     def _backs_in_vain(self, command: VelocityCommand, now_s: float) -> bool:
         """Whether an obstacle blocks the way back."""

@@ -45,7 +45,7 @@ class ObedientVehicle:
             self.flight_controller.plan(state)
             order = self.flight_controller.order(state)
             if order.land:
-                self.land(str(order.danger))
+                self.land(order.command.why)
             w, (c, s) = order.command, (math.cos(self.yaw), math.sin(self.yaw))
             self.v = np.array([c * w.forward_m_s - s * w.left_m_s, s * w.forward_m_s + c * w.left_m_s, w.up_m_s])
             self.yaw += TICK_S * w.turn_left_rad_s

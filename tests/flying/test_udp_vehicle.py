@@ -107,7 +107,8 @@ def test_planner_and_supervisor_fly_and_a_hung_planner_is_stopped(flight):
     until(lambda: flight_controller.last.danger is Danger.NO_COMMAND)
     flight_controller.pilot.go_on.set()
     until(lambda: forward(emulator) == pytest.approx(0.3))
-    vehicle.land("as commanded")
+    flight_controller.land("as commanded")
+    vehicle.fly(lambda: False)
     assert vehicle.over == "as commanded" and not vehicle.flying
     until(lambda: emulator.drone.mode is Mode.GROUND)
 

@@ -126,9 +126,9 @@ def _connect(args: argparse.Namespace, limits: "NavLimits", signals: Signals, pr
             """On a signal: land and finish in order; interrupt before the take-off is complete."""
             if not nav.vehicle.flying and not nav.vehicle.over:
                 raise KeyboardInterrupt
-            nav.vehicle.stop(f"by {signals.name}")
+            nav.flight_controller.land(f"by {signals.name}")
 
-        with keys(nav.flight_controller.hold, lambda: nav.vehicle.land("by the keyboard")) as listens:
+        with keys(nav.flight_controller.hold, lambda: nav.flight_controller.land("by the keyboard")) as listens:
             if listens:
                 say("space toggles hovering; l, q or Ctrl-C lands")
             signals.tell(end, patient=True)
