@@ -385,7 +385,7 @@ class MotionFusion:
         if turned is None:
             return
         orientation.found = turned
-        present = FlightSoFar(self._memory, self._track, turned.R_b_c, metres.rough(), metres.network())
+        present = FlightSoFar(self._memory, self._track, orientation.T_b_c, metres.rough(), metres.network())
         self._comparison.judge(self._trust, present, self.flight.delay.delay, turned.R_w_m, flying)
         previous_scale = metres.previous_scale()
 

@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -308,7 +309,7 @@ def test_benchmark_runs_on_what_it_fetched(one, tmp_path, monkeypatch):
     seen = {}
 
     def run_benchmark(settings, out, say):
-        seen.update(data=settings.data, only=settings.only, found=benchmark.sequences(settings, 0.5, ()))
+        seen.update(data=settings.data, only=settings.only, found=benchmark.sequences(replace(settings, min_hz=0.5)))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(benchmark, "run_benchmark", run_benchmark)

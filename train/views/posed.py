@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.run_folder import is_supported, read_status
 from edgeslam_torch.files.plain import open_plain
 from edgeslam_torch.files.record_files import read_mapping
@@ -109,7 +110,7 @@ def load_run(
         recording = source if source is not None else str(folder.resolve() / summary["source"]["path"])
         poses = {round(float(row[0]), 6): _pose(row) for row in rows}
         trusted = _trusted_stamps(folder)
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+    except (OSError, ValueError, KeyError, TypeError, IndexError, EvaluationError) as error:
         why = " ".join(str(error).split())
         raise SourceError(f"{folder}: not the output of 'edgeslam run' ({type(error).__name__}: {why})") from error
     clouds = [read_ply(folder / n).p_w for n in ("anchors.ply", "edge_map.ply") if (folder / n).is_file()]

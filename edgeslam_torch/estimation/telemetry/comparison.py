@@ -62,8 +62,8 @@ class FlightSoFar:
 
     memory: VisualMemory
     track: TelemetryTrack
-    R_b_c: FloatArray
-    """Camera in the body ``(3, 3)``."""
+    T_b_c: FloatArray
+    """Camera in the body ``(4, 4)`` [m]."""
     rough_scale: float | None
     """Metres per map unit, for what counts as motion."""
     network: ScaleBelief | None = None
@@ -124,7 +124,7 @@ class Comparison:
         low, high = self._config.delay_range_s if fixed is None else (fixed - _FIXED_REACH_S, fixed + _FIXED_REACH_S)
         best, best_s = now, used_s
         for delay_s in np.arange(_WIDE_DELAYS_S[0], _WIDE_DELAYS_S[1] + 1e-9, _WIDE_STEP_S).tolist():
-            R = map_to_world(present.memory.sightings(), present.track, delay_s, present.R_b_c)
+            R = map_to_world(present.memory.sightings(), present.track, delay_s, present.T_b_c[:3, :3])
             found = None if R is None else self._velocity(present, delay_s, R)
             if found is not None and found.count >= now.count // 2 and found.correlation > best.correlation:
                 best, best_s = found, delay_s
@@ -133,21 +133,20 @@ class Comparison:
     def _velocity(self, present: FlightSoFar, delay_s: float, R_w_m: FloatArray) -> Agreement:
         """Agreement of velocities with the images at one delay.
 
-        The camera's lever arm is left out: rotations must not count as evidence for velocities.
+        The camera's lever arm is left out of the correlation, for which rotations must not count as evidence.
         """
         track = present.track
         moved = in_common(present.memory.displacements(), track, delay_s)
         if len(moved) == 0:
             return Agreement()
         duration = moved.duration_s[:, None]
-        reported = camera_moved(moved, track, np.zeros(3))
+        reported, at_camera = (camera_moved(moved, track, arm) for arm in (np.zeros(3), present.T_b_c[:3, 3]))
         slow = MIN_SPEED_M_S
         least_seen = math.inf if present.rough_scale is None else 2.0 * slow / present.rough_scale
         seen, reported = moved.moved @ R_w_m.T / duration, reported / duration
         found = agreement(seen, reported, least_seen, slow, early=True)
         R_w = track.axes()[np.searchsorted(track.readings.stamp_s, 0.5 * (moved.from_s + moved.to_s))]
-        seen, reported = (np.einsum("nwa,nw->na", R_w, v) for v in (seen, reported))
-        wrong = wrong_columns(seen, reported)
+        wrong = wrong_columns(*(np.einsum("nwa,nw->na", R_w, v) for v in (seen, at_camera / duration)))
         broken = tuple(name for name, share in zip(VELOCITY, wrong, strict=True) if share > SURELY_WRONG)
         return replace(found, broken=broken, wrong=wrong)
 
@@ -156,7 +155,7 @@ class Comparison:
         moved = in_common(present.memory.displacements(), present.track, delay.value_s)
         if len(moved) == 0:
             return None
-        both = turns(moved, present.track, present.R_b_c)
+        both = turns(moved, present.track, present.T_b_c[:3, :3])
         seen, reported = (vectors_from_matrices(R) / moved.duration_s[:, None] for R in (both.seen, both.reported))
         found = agreement(seen, reported, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
         return replace(found, broken=self._broken_attitude(present, delay))
@@ -171,7 +170,7 @@ class Comparison:
             reported = attitudes(sightings, present.track, delay_s)
             if reported is not None and len(reported.stamp_s) >= _FEW_ATTITUDES:
                 ratios.append(
-                    self._relative_deviation(reported, present.R_b_c, delay.sigma_s if known else _DELAY_STEP_S)
+                    self._relative_deviation(reported, present.T_b_c[:3, :3], delay.sigma_s if known else _DELAY_STEP_S)
                 )
         if not ratios:
             return ()
