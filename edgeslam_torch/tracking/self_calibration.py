@@ -51,7 +51,8 @@ sigma."""
 _REFINED_KEYFRAMES, _REFINED_ANCHORS = 40, 600
 """Maximum numbers of keyframes and anchors for a refinement with a free focal length: up to half a second of CPU, once
 per run."""
-_REFINEMENT = LmConfig(diagnostics=False, max_iterations=30, mu=1e-8, cost_tolerance=1e-6, pose_tolerance=1.0)
+_REFINEMENT = LmConfig(diagnostics=False, max_iterations=30, mu=1e-8, cost_tolerance=1e-6, pose_tolerance=0.1)
+"""Accurate poses: the derivative of the cost by the focal length is that of the minimum."""
 _NEWTON_STEPS, _FOCAL_STEP, _MAX_MOVE, _CONVERGED = 10, 0.04, 0.25, 0.01
 """Newton's method for the log focal length: number of steps, step of the numerical derivative, largest change, and
 convergence threshold."""
@@ -213,10 +214,11 @@ def focal_from_map(camera: Camera, keyframes: Sequence[Keyframe], p_w: FloatArra
         limit = limit / 3.0 if move * last < 0 else limit  # Huber's cost is not quadratic: steps overshoot
         last = move
         log_scale += float(np.clip(move, -limit, limit))
-        if abs(move) < max(_CONVERGED, _CONTRADICTION / 3.0 - abs(log_scale)):  # what agrees need not be exact
+        enough = max(_CONVERGED, _CONTRADICTION / 3.0 - abs(log_scale))  # what agrees need not be exact
+        if curvature > 0 and abs(move) < enough:
             noise = float(np.sqrt(np.median(here.chi2) / _CHI2_MEDIAN))
             focal = camera.fx * math.exp(log_scale)
-            relative = math.hypot(_OPTIMISM * noise / math.sqrt(max(curvature, 1e-12)), 0.02)
+            relative = math.hypot(_OPTIMISM * noise / math.sqrt(curvature), 0.02)
             return FocalEstimate(focal, relative * focal, len(problem.T_c_w), "")
     return FocalEstimate(None, np.inf, len(problem.T_c_w), "the map fits no focal length")
 

@@ -16,6 +16,8 @@ from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.self_calibration import (
     FocalEstimate,
     _map_problem,
+    _refined_with,
+    _slope,
     calibration_warning,
     contradicts,
     focal_from_map,
@@ -233,6 +235,22 @@ def test_a_refined_map_gives_the_focal_length_and_its_sigma(factor):
     assert estimate.focal_px == pytest.approx(500.0, rel=0.03)
     assert abs(estimate.focal_px - 500.0) < 2.0 * estimate.sigma_px
     assert contradicts(estimate, camera) is (factor != 1.0)
+
+
+def test_the_slope_of_a_refined_map_is_that_of_its_least_cost():
+    """Poses short of their minimum add their own slope, from which Newton's method does not recover."""
+    keyframes = walked_keyframes(np.random.default_rng(3), 24)
+    camera = another_lens(0.7)
+    problem = _map_problem(camera, keyframes, cloud(np.random.default_rng(3)))
+    near = _refined_with(problem, camera, 0.085)
+    here = _refined_with(replace(problem, T_c_w=near.T_c_w, p_w=near.p_w), camera, 0.1)
+    slope = _slope(replace(problem, T_c_w=here.T_c_w, p_w=here.p_w), camera, 0.1)
+
+    def least(log_scale):
+        K = tuple(k * s for k, s in zip(problem.K, [np.exp(log_scale)] * 2 + [1.0, 1.0], strict=True))
+        return refine_window(replace(problem, K=K), LmConfig(max_iterations=200, cost_tolerance=1e-12)).cost_after
+
+    assert slope == pytest.approx((least(0.11) - least(0.09)) / 0.02, rel=0.05)
 
 
 def test_a_guessed_focal_length_is_not_contradicted(rng):
