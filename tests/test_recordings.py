@@ -51,3 +51,11 @@ def test_two_runs_of_a_recording_give_the_same_bytes(data_dir, tmp_path):
         run(open_source(data_dir / "tum_fr1_xyz", max_frames=150), tmp_path / out, SlamConfig())
     for name in ("trajectory.txt", "edge_map.ply", "anchors.ply"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.3])
+def test_a_focal_length_of_another_lens_is_said(data_dir, tmp_path, factor):
+    source = open_source(data_dir / "tum_fr1_xyz", max_frames=250)
+    camera = replace(source.camera, fx=factor * source.camera.fx, fy=factor * source.camera.fy)
+    result = run(replace(source, camera=camera), tmp_path / "out", SlamConfig())
+    assert any("contradict the calibration" in warning for warning in result.summary["warnings"])
