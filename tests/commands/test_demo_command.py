@@ -60,7 +60,7 @@ def test_demo_runs_and_judges_itself(tmp_path):
     # So short a flight states too little: 1.9 sigmas off in the mean square of nine seeds, .8 in flights of 20 s.
     assert abs(demo.score.scale_error) < 3.5 * demo.run.summary["scale"]["sigma"] / demo.run.summary["scale"]["value"]
     assert demo.map is not None
-    assert demo.map.points > 11_500
+    assert demo.map.points > 10_500  # 11 to 12 thousand: telemetry that moves the scale by a percent moves a twentieth
     assert demo.map.median_m < 0.065
     written = json.loads((tmp_path / "demo.json").read_text())
     assert written["frames"] == 72
