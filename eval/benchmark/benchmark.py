@@ -108,7 +108,6 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
         folders[SYNTHETIC] = _record_synthetic(out, settings, say)
     record: dict[str, Any] = {
         "format": FORMAT,
-        "commit": code_state(),
         **conditions(),
         **asked(settings),
         "mode": settings.mode,
@@ -122,7 +121,7 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
 def conditions() -> dict[str, Any]:
     """Of all runs of a record."""
     made = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    return {"version": __version__, "made": made, "machine": machine()}
+    return {"version": __version__, "commit": code_state(), "made": made, "machine": machine()}
 
 
 def asked(settings: BenchSettings) -> dict[str, Any]:
