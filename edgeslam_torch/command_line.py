@@ -95,7 +95,7 @@ def _check_plain(args: argparse.Namespace) -> None:
                     with suppress(OSError, ValueError):
                         kind = os.stat(name).st_mode
                         if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
-                            raise SourceError(f"{name}: is no plain file or folder")
+                            raise SourceError(f"{name}: is neither a regular file nor a folder")
 
 
 def _add_arguments(parser: Parser, module: ModuleType) -> None:
@@ -120,7 +120,7 @@ def _top_parser(commands: Commands) -> Parser:
         prog="edgeslam",
         usage="edgeslam [-v] COMMAND ...",
         description="Metric monocular SLAM with a semi-dense edge map.",
-        epilog=f"commands:\n\n{listing(commands)}\n\n'edgeslam COMMAND --help' tells options and examples of one.",
+        epilog=f"commands:\n\n{listing(commands)}\n\n'edgeslam COMMAND --help' lists options and examples of one.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"edgeslam {__version__}")

@@ -27,5 +27,5 @@ def needs_extra(extra: str, purpose: str) -> Iterator[None]:
 
 
 def install_command(extra: str) -> str:
-    """How to install an extra; with the package installed, pip asks the index for the extra's packages only."""
+    """How to install an extra; with the package installed, pip installs the extra's packages only."""
     return f"pip install 'edgeslam-torch[{extra}]'"

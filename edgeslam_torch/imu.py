@@ -154,7 +154,7 @@ class ImuModel(Record):
             whole = T.shape == (4, 4) and np.isfinite(T).all() and T[3].tolist() == [0, 0, 0, 1]
             R = T[:3, :3] if whole else np.zeros((3, 3))
             if not np.allclose(R @ R.T, np.eye(3), atol=_RIGID) or np.linalg.det(R) < 0:
-                raise ValueError("T_imu_cam is no rotation and translation, camera to IMU")
+                raise ValueError("T_imu_cam is not a rotation and translation, camera to IMU")
 
 
 Reading = TelemetrySample | ImuReadings

@@ -109,7 +109,7 @@ def _is_torch_zip(path: Path) -> bool:
         with open_weights(path) as file:  # regular files only: a pipe never ends
             return is_zip(file)
     except (OSError, WeightsError):
-        return False  # `read_weights` says why
+        return False  # `read_weights` states the reason
 
 
 def _read_torch(path: Path) -> tuple[dict[str, Array], Metadata]:

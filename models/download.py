@@ -95,7 +95,7 @@ def download(
         except FAILURES as error:
             reasons.append(f"{url} ({reason_of(error)})")
     else:
-        raise WeightsError(f"download failed: {'; '.join(reasons)}; what has come is kept, run it again to go on")
+        raise WeightsError(f"download failed: {'; '.join(reasons)}; the part received is kept; run it again to resume")
     found, before = _hash(part), remembered(target)
     expected = (sha256 or before or found).lower()
     if found != expected:

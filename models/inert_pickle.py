@@ -83,13 +83,13 @@ class InertPickle:
                     raise WeightsError(f"no checkpoint of torch: pickle instruction 0x{code.hex()}")
                 instruction(self)
         except (IndexError, KeyError, TypeError, ValueError, AttributeError):
-            raise WeightsError("damaged checkpoint: its pickle makes no sense") from None
+            raise WeightsError("damaged checkpoint: its pickle is malformed") from None
         raise WeightsError(f"no checkpoint of ours: its pickle has more than {MAX_STEPS} instructions")
 
     def _take(self, count: int) -> bytes:
         end = self.position + count
         if end > len(self._data):
-            raise WeightsError("truncated checkpoint: its pickle breaks off")
+            raise WeightsError("truncated checkpoint: its pickle ends early")
         taken = self._data[self.position : end]
         self.position = end
         return taken
@@ -100,7 +100,7 @@ class InertPickle:
     def _line(self) -> str:
         end = self._data.find(b"\n", self.position, self.position + 200)
         if end < 0:
-            raise WeightsError("damaged checkpoint: its pickle makes no sense")
+            raise WeightsError("damaged checkpoint: its pickle is malformed")
         line = self._take(end - self.position)
         self.position += 1
         return line.decode()

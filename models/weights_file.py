@@ -189,6 +189,6 @@ def _read_header(file: BinaryIO) -> tuple[Metadata | None, dict[str, Entry]]:
         raise WeightsError(str(error)) from None
     record = remarks.get(HEADER_KEY)
     if not isinstance(record, str | None):
-        raise WeightsError("its metadata cannot be used: it is no text")
+        raise WeightsError("its metadata cannot be used: it is not text")
     entries = {plain_name(name): entry for name, entry in entries.items()}
     return None if record is None else metadata_from_json(record), entries

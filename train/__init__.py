@@ -1,4 +1,4 @@
-"""Depth training: data, recipes and hooks; docs/guides/your-own-loop.md says how to use them.
+"""Depth training: data, recipes and hooks; see docs/guides/your-own-loop.md.
 
 The names below load on first use; type checkers see them in ``__init__.pyi``.
 """

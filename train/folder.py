@@ -73,7 +73,7 @@ class OutFolder:
             strange = next((name for name in FILES if (self.path / name).exists()), None)
             if strange is not None:
                 raise OutputError(
-                    f"{self.path}: holds {strange}, but no {RECORD} that says where it is from; give another --out"
+                    f"{self.path}: holds {strange}, but no {RECORD} that states its origin; give another --out"
                 )
             check_free(self.path, ())
             if self.existing is Existing.RESUME:
@@ -83,12 +83,12 @@ class OutFolder:
             return
         steps = given.settings["steps"]
         if step > steps:
-            raise ConfigError(f"{self.path}: has {step} steps behind it, so it cannot end after {steps}")
+            raise ConfigError(f"{self.path}: has {step} steps already, so it cannot end after {steps}")
         ignored = WITH_RESUME if self.existing is Existing.RESUME else NOT_COMPARED
         different = given_from_json(record["given"]).differences(given, ignored)
         if different:
             only_rate = not given_from_json(record["given"]).differences(given, WITH_RESUME)
-            way_out = "--resume to go on like this" if only_rate else "--overwrite to replace it"
+            way_out = "--resume to continue with it" if only_rate else "--overwrite to replace it"
             raise ConfigError(
                 f"{self.path}: holds another fine-tuning ({'; '.join(different)}); give another --out, or {way_out}"
             )

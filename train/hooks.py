@@ -38,7 +38,7 @@ class Hooks:
     In order: ``on_start``; for every step ``on_losses`` (once a signal) and ``on_step``; at times ``on_validation``;
     ``on_end``; ``close``. Under ``torchrun`` each process calls its own hooks, for its own images: what only reports
     does so where `edgeslam_torch.train.rank` gives 0. A step depends on the seed, its number and the weights alone, so
-    that a resume repeats it; a hook that draws random numbers or remembers steps has to see to that itself. An
+    that a resume repeats it; a hook that draws random numbers or keeps state has to restore them itself. An
     exception ends training, with the last whole step saved.
     """
 
@@ -89,7 +89,7 @@ def named_hooks(names: Sequence[str]) -> list[Hooks]:
     Modules are looked for in the current folder, too. They are run: name only code that you trust.
 
     Raises:
-        ConfigError: If there is no such thing, or it is no hook; one line that says which.
+        ConfigError: If it does not exist, or is not a hook.
     """
     return [_made(name) for name in names]
 
@@ -105,7 +105,7 @@ def _made(name: str) -> Hooks:
             f"--hook {name}: {why}; write MODULE:NAME or FILE.py:NAME of an instance, or of a class without arguments"
         ) from error
     if not isinstance(hook, Hooks):
-        raise ConfigError(f"--hook {name}: is no edgeslam_torch.train.Hooks")
+        raise ConfigError(f"--hook {name}: is not an edgeslam_torch.train.Hooks")
     return hook
 
 

@@ -65,10 +65,10 @@ class Inputs:
 
 
 def given_from_json(record: dict[str, Any]) -> Inputs:
-    """The record that `dataclasses.asdict` and JSON made of a `Inputs`.
+    """The record that `dataclasses.asdict` and JSON made of `Inputs`.
 
     Raises:
-        KeyError, TypeError: If it is none.
+        KeyError, TypeError: If it is not such a record.
     """
     sets = {what: tuple(DataSet(**entry) for entry in record[what]) for what in ("data", "validation")}
     return Inputs(str(record["weights"]), sets["data"], sets["validation"], dict(record["settings"]))

@@ -38,7 +38,7 @@ NO_ROOM_M = (0.02, 90.0)
 
 
 class DivergedError(EdgeSlamError):
-    """Training has diverged; the message says what is kept."""
+    """Training has diverged; the message names the files that are kept."""
 
 
 class NonFiniteLossError(DivergedError):
@@ -101,7 +101,7 @@ def train(
     if not resume(state, out / LAST) and before is not None:
         state.best, state.history = before["score"], [{"step": 0.0, **before}]
     if state.step > config.steps:
-        raise ConfigError(f"{out / LAST}: has {state.step} steps behind it, so it cannot end after {config.steps}")
+        raise ConfigError(f"{out / LAST}: has {state.step} steps already, so it cannot end after {config.steps}")
     with ExitStack() as closing:
         for hook in hooks:
             closing.callback(hook.close)

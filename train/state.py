@@ -173,4 +173,4 @@ def _damage_is_named(path: Path) -> Iterator[None]:
         yield
     except (RuntimeError, EOFError, ValueError, KeyError, TypeError, pickle.UnpicklingError) as error:
         why = " ".join(str(error).split())[:160]
-        raise WeightsError(f"{path}: damaged or of another network, training cannot go on from it ({why})") from error
+        raise WeightsError(f"{path}: damaged or of another network, training cannot resume from it ({why})") from error

@@ -321,7 +321,7 @@ def _camera_of(K: FloatArray, distortion: FloatArray, size: tuple[int, int], sou
         check_camera(camera)
     except CalibrationError as error:
         raise CalibrationError(
-            f"these pictures give a camera that cannot be ({error}); photograph the board tilted, from all sides"
+            f"these pictures give an impossible camera ({error}); photograph the board tilted, from all sides"
         ) from error
     return camera
 

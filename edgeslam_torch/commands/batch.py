@@ -75,7 +75,9 @@ def main(args: argparse.Namespace) -> int:
     try:
         rows = run_batch(flights, _settings(args), args.out, _runner(args), _say)
     except KeyboardInterrupt:
-        sys.stderr.write(f"edgeslam: interrupted; {args.out} holds what was finished, the same command goes on\n")
+        sys.stderr.write(
+            f"edgeslam: interrupted; {args.out} holds what was finished; run the same command to continue\n"
+        )
         return EXIT_INTERRUPTED
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error

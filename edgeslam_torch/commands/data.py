@@ -47,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         fetch(args.names, recordings_folder(args.to), args.agree, print, args.archive, args.keep_archives)
     except KeyboardInterrupt:
-        sys.stderr.write("edgeslam: interrupted; the same command goes on where it stopped\n")
+        sys.stderr.write("edgeslam: interrupted; run the same command to resume\n")
         return EXIT_INTERRUPTED
     return 0
 

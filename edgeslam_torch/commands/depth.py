@@ -20,7 +20,7 @@ FILES = """\
 files written for every image STEM.jpg, pixel for pixel, lens distortion removed:
   STEM.npy         depth along the optical axis in metres, float32; NaN where unknown
   STEM.png         the same in millimetres, 16 bit; 0 where nothing is known, 65535 for 65.5 m and beyond
-  STEM_colour.png  to look at: near is red, far is blue, unknown is black; the bar below tells the metres
+  STEM_colour.png  to look at: near is red, far is blue, unknown is black; the bar below shows the metres
   STEM_sigma.npy   with --sigma: standard deviation of the logarithm of depth, float32; 0.1 is about 10 %
 """
 MAX_MILLIMETRES = 65535

@@ -150,8 +150,8 @@ def _nerfstudio(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace)
 def _seen(
     run: "RunFolder", without: str = "points are not linked to images"
 ) -> "tuple[Observations, PointCloud, list[int]]":
-    """What keyframes saw of the anchors, the anchors, and the keyframes' rows in the trajectory; `without` says what it
-    means that a run does not tell."""
+    """What keyframes saw of the anchors, the anchors, and the keyframes' rows in the trajectory; `without` describes
+    the consequence of a run without them."""
     import numpy as np
 
     from edgeslam_torch.eval.inputs.associate import nearest

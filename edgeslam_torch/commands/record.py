@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fly",
         action="store_true",
-        help="fly: take off, sweep up, down and to both sides by half a metre and turn, again and again, land; needs a "
+        help="fly: take off, sweep up, down and to both sides by half a metre and turn, repeatedly, then land; needs a "
         "metre of free space around",
     )
 
@@ -152,7 +152,7 @@ def _write_frames(
 
 
 class _Status:
-    """What the pilot does, what a drone says of itself, and how long nothing was seen."""
+    """The pilot's action, the drone's own state, and the time without a picture."""
 
     def __init__(self, source: "LiveSource", messages: "list[StateMessage]") -> None:
         self._source, self._messages = source, messages

@@ -275,7 +275,7 @@ def _check_atlas_can_be_saved(path: Path | None) -> None:
         from edgeslam_torch.atlas.atlas_file import is_atlas
 
         if not is_atlas(path):
-            raise OutputError(f"{path}: is no atlas and stays; give another file to --save-atlas")
+            raise OutputError(f"{path}: is not an atlas and is not replaced; give another file to --save-atlas")
 
 
 def _atlas_words(summary: dict[str, Any]) -> list[str]:
@@ -373,11 +373,8 @@ def _lost_words(summary: dict[str, Any]) -> str:
     """How often tracking was lost; empty if there was no tracking."""
     if not summary["tracked"] and not summary["lost_events"]:
         return ""
-    return f"lost {_times(summary['lost_events'])}, "
-
-
-def _times(count: int) -> str:
-    return {0: "never", 1: "once"}.get(count, f"{count} times")
+    count = summary["lost_events"]
+    return {0: "never lost, ", 1: "lost once, "}.get(count, f"lost {count} times, ")
 
 
 def _say(text: str) -> None:

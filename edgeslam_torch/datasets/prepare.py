@@ -93,7 +93,7 @@ def check_recording(folder: Path) -> None:
     """
     sequence = read_sequence(folder)
     if sequence is None or not sequence.images:
-        raise SourceError(f"{folder}: what was unpacked is no recording; has the publisher changed the archive?")
+        raise SourceError(f"{folder}: what was unpacked is not a recording; has the publisher changed the archive?")
 
 
 def _numbers(text: str, count: int, name: str) -> list[list[float]]:

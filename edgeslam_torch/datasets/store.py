@@ -75,7 +75,7 @@ def is_nested(recording: Recording) -> bool:
 
 
 def check_space(recordings: Sequence[Recording], root: Path) -> None:
-    """Refuse before the first byte what the disk has no room for.
+    """Refuse, before the first byte, a download that does not fit on the disk.
 
     Raises:
         OutputError: If there is not enough.
@@ -175,10 +175,10 @@ def _download(archive: Archive, target: Path, expected: str | None, progress: Pr
         except _Broken as error:
             reasons.append(f"{url} ({error})")
         except ValueError as error:
-            raise SourceError(f"{archive.file}: not the file that it should be; it was deleted ({error})") from error
+            raise SourceError(f"{archive.file}: not the expected file; it was deleted ({error})") from error
     raise SourceError(
-        f"{archive.file}: download failed: {'; '.join(reasons)}; what has come is kept, the same command goes on. "
-        f"If the publisher has moved it, download it by hand and give --archive FILE"
+        f"{archive.file}: download failed: {'; '.join(reasons)}; the part received is kept; "
+        f"run the same command to resume. If the publisher has moved it, download it by hand and give --archive FILE"
     )
 
 

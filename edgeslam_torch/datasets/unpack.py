@@ -118,7 +118,7 @@ def _copy(source: IO[bytes], target: Path, size: int, archive: Path) -> None:
             file.write(chunk)
             left -= len(chunk)
         if left or source.read(1):
-            raise SourceError(f"{archive}: damaged: {target.name} is not as long as it says")
+            raise SourceError(f"{archive}: damaged: {target.name} has not the length that its header states")
 
 
 class _TarInfo(tarfile.TarInfo):
@@ -193,7 +193,9 @@ def _checked(archive: Path, members: list[_Member | None]) -> list[_Member]:
     files = [m for m in members if m is not None and not any(part in _JUNK for part in m.parts)]
     size, packed = sum(m.size for m in files), archive.stat().st_size
     if len(files) > MAX_FILES or size > MAX_GROWTH * packed + (16 << 20):
-        raise SourceError(f"{archive}: would unpack to {len(files)} files of {size / 1e9:.1f} GB; that is no recording")
+        raise SourceError(
+            f"{archive}: would unpack to {len(files)} files of {size / 1e9:.1f} GB; too much for a recording"
+        )
     if size > shutil.disk_usage(archive.parent).free:
         raise OSError(28, f"{size / 1e9:.1f} GB do not fit on the disk", str(archive.parent))
     return files

@@ -120,7 +120,7 @@ def _is_demo(recording: Path) -> bool:
 
 
 def _clear(recording: Path) -> None:
-    """Take away the images of an older demo: a shorter flight must not keep the longer one's.
+    """Remove the images of an older demo: a shorter flight must not keep the longer one's.
 
     Raises:
         OutputError: If the folder holds something else.

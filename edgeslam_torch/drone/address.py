@@ -63,5 +63,5 @@ class TelloAddress:
         except (OSError, UnicodeError) as error:
             reason = getattr(error, "strerror", None) or error
             raise TelloError(
-                f"{self.host}: no way there ({reason}); join the drone's Wi-Fi (TELLO-XXXXXX) first"
+                f"{self.host}: unreachable ({reason}); join the drone's Wi-Fi (TELLO-XXXXXX) first"
             ) from error

@@ -73,8 +73,8 @@ class ScaleEstimator:
         """Update with telemetry.
 
         Args:
-            found: Its beliefs by source; empty where its readings tell no scale, None where none of them moved: then
-                the previous ones stay.
+            found: Its beliefs by source; empty where its readings determine no scale, None where none of them moved:
+                then the previous ones stay.
             fit: Details of the fit.
             trust: Usable readings; previous beliefs that rest on others are dropped.
         """
@@ -106,7 +106,7 @@ class ScaleEstimator:
         """Which sources are used; cached, since it is read several times a frame."""
         depth = self._depth.scale()
         beliefs = [self._with_common(b) for b in self._by_telemetry.values()]
-        # An earlier flight's scale includes the network's; beside an IMU neither says anything.
+        # An earlier flight's scale includes the network's; beside an IMU neither adds information.
         network = self.network() if self._remembered is None else self._remembered
         beliefs += [self.inertial] if self.inertial is not None else [network] if network is not None else []
         if tuple(beliefs) != self._beliefs:

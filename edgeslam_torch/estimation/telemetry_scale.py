@@ -318,7 +318,7 @@ class TelemetryScale:
                 continue
             tilt = self._tilt_rad
             aged, wander = self._aged(times[here]), MAP_WANDER_LOG[0] if moved is None else moved.wander
-            if moved is None:  # nothing else tells how far the scale of other views differs
+            if moved is None:  # no other estimate of how far the scale of other views differs
                 by_views = np.interp(times[here], stamps_s, turned_since(seen.T)) * (_OF_A_VIEW / wander) ** 2
                 aged = by_views if aged is None else aged + by_views
             evidence = height_evidence(

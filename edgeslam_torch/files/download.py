@@ -1,4 +1,4 @@
-"""Downloads that go on where they broke off, and checksums remembered from the first time."""
+"""Downloads that resume after an interruption, and checksums stored at the first download."""
 
 import http.client
 import re
@@ -23,7 +23,7 @@ LOWEST_SPEED = 10e3
 """Bytes a second, over `WATCHED_S` each; a slower server is given up. It also ends the time that a file may take."""
 WATCHED_S = 60.0
 LONGEST_S = 12 * 3600.0
-"""A file that takes longer goes on where it broke off, when asked for again."""
+"""A download that takes longer is resumed by the next call."""
 USER_AGENT = "edgeslam-torch"
 """Some repositories of universities refuse Python's own."""
 
@@ -76,7 +76,7 @@ def fetch(url: str, part: Path, max_bytes: int, progress: Progress | None = None
                 file.write(chunk)
                 have += len(chunk)
                 if have > max_bytes:
-                    raise ValueError("the server sends without end")
+                    raise ValueError(f"the server sends more than {max_bytes} bytes")
                 if progress is not None:
                     progress(have, total)
                 now_s = time.monotonic()
@@ -91,7 +91,7 @@ def fetch(url: str, part: Path, max_bytes: int, progress: Progress | None = None
 
 
 def _answer(request: urllib.request.Request) -> Any:
-    """The server's answer, its body unread; the time-out of a socket begins anew with every byte."""
+    """The server's answer, its body unread; the time-out of a socket restarts with every byte."""
     found: list[Any] = []
 
     def ask() -> None:
@@ -133,7 +133,7 @@ class KeepEncryption(urllib.request.HTTPRedirectHandler):
         self, request: urllib.request.Request, file: IO[bytes], code: int, message: str, headers: Any, url: str
     ) -> urllib.request.Request | None:
         if request.type == "https" and not url.startswith("https:"):
-            raise urllib.error.URLError(f"leads from https to {url[:80]}")
+            raise urllib.error.URLError(f"redirects from https to {url[:80]}")
         return super().redirect_request(request, file, code, message, headers, url)
 
 
@@ -158,12 +158,12 @@ def remember(target: Path, sha256: str) -> Path:
 
 
 def _continued_at(response: Any, have: int) -> int:
-    """Bytes that need not be sent again; 0 when the server begins anew."""
+    """Bytes that need not be sent again; 0 when the server restarts."""
     if response.status != 206:
         return 0
     stated = re.match(r"bytes (\d+)-", response.headers.get("Content-Range") or f"bytes {have}-")
     if stated is None or int(stated[1]) != have:
-        raise ValueError(f"the server sends another piece than from byte {have} on")
+        raise ValueError(f"the server does not resume at byte {have}")
     return have
 
 

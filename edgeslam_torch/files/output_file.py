@@ -1,4 +1,4 @@
-"""Files that the user names for a command to write: nothing is replaced unasked.
+"""Files that the user names for a command to write: nothing is replaced without --overwrite.
 
 One rule for every command: what exists is replaced with ``--overwrite`` alone, and what the command reads never, by
 whatever name or hard link it is given. Folders of runs have a rule of their own, `edgeslam_torch.writers.own_folder`.

@@ -16,7 +16,7 @@ _NO_WAIT = getattr(os, "O_NONBLOCK", 0)
 """A named pipe does not hold up whoever opens it."""
 _COMMON = getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0) | _NO_FOLLOW
 _MODE = 0o666
-"""The umask takes away from it."""
+"""The umask clears bits of it."""
 
 
 def open_plain(path: Path) -> BinaryIO:
@@ -28,7 +28,7 @@ def open_plain(path: Path) -> BinaryIO:
     handle = os.open(path, os.O_RDONLY | _NO_WAIT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
-        raise OSError(errno.EINVAL, "is no plain file", str(path))
+        raise OSError(errno.EINVAL, "is not a regular file", str(path))
     return os.fdopen(handle, "rb")
 
 
@@ -45,7 +45,7 @@ def check_replaceable(path: Path) -> None:
     if stat.S_ISDIR(kind):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not (stat.S_ISREG(kind) or stat.S_ISLNK(kind)):
-        raise OSError(errno.EINVAL, "is no plain file", str(path))
+        raise OSError(errno.EINVAL, "is not a regular file", str(path))
 
 
 def create(path: Path) -> BinaryIO:
@@ -138,7 +138,7 @@ def _raw(handle: int, mode: str, checked: Path | None = None) -> Any:
         if checked is not None:
             state = os.fstat(handle)
             if not stat.S_ISREG(state.st_mode) or state.st_nlink > 1:
-                raise OSError(errno.EINVAL, "is no plain file of one name", str(checked))
+                raise OSError(errno.EINVAL, "is not a regular file, or has hard links", str(checked))
         return os.fdopen(handle, mode, buffering=0)
     except BaseException:
         os.close(handle)

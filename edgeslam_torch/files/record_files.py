@@ -21,7 +21,7 @@ def plain_yaml(text: str) -> Any:
     OpenCV's header line is accepted, tags such as ``!!opencv-matrix`` are ignored.
 
     Raises:
-        ValueError: If it is malformed, or a key stands twice.
+        ValueError: If it is malformed, or a key occurs twice.
         RecursionError: If it is nested too deeply.
     """
     import yaml
@@ -35,7 +35,7 @@ def plain_yaml(text: str) -> Any:
         def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
             names = [key.value for key, _ in node.value if isinstance(key.value, str)]
             if len(set(names)) < len(names):
-                raise ValueError(f"{next(name for name in names if names.count(name) > 1)[:40]!r} stands twice")
+                raise ValueError(f"{next(name for name in names if names.count(name) > 1)[:40]!r} occurs twice")
             return super().construct_mapping(node, deep)
 
         def construct_tagged(self, _: str, node: Any) -> Any:

@@ -79,7 +79,7 @@ def read_entries(file: BinaryIO, sizes: Mapping[str, int]) -> tuple[dict[str, An
     except (ValueError, RecursionError):
         raise Damaged("not a safetensors file, or damaged: its header is not JSON") from None
     if not isinstance(header, dict):
-        raise Damaged("damaged: its header is no table")
+        raise Damaged("damaged: its header is not a table")
     remarks = header.pop("__metadata__", None) or {}
     end = file.seek(0, 2)
     entries = {name: _entry(file, name, fields, 8 + length, end, sizes) for name, fields in header.items()}
@@ -131,5 +131,5 @@ def _check_disjoint(entries: Mapping[str, Entry]) -> None:
     last = 0
     for name, entry in sorted(entries.items(), key=lambda item: item[1].start):
         if entry.size and entry.start < last:
-            raise Damaged(f"damaged: {name[:80]!r} lies over another tensor")
+            raise Damaged(f"damaged: {name[:80]!r} overlaps another tensor")
         last = max(last, entry.start + entry.size)

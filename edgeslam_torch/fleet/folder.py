@@ -107,7 +107,7 @@ class BatchFolder:
         try:
             return signature(path, self.path)
         except OSError:
-            return ""  # a preset's name, or a file that is not there, which the flight's own process says
+            return ""  # a preset's name, or a file that is not there, which the flight's own process reports
 
 
 def finished_flights(path: Path) -> list[Path] | None:

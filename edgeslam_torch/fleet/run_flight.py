@@ -28,7 +28,7 @@ def run_flight(task: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Leave a finished run in ``flights`` and a small picture; returns figures and notes.
 
     Args:
-        task: What `BatchFolder.task` says.
+        task: As made by `BatchFolder.task`.
         folder: Of the task, in a batch's ``jobs``.
 
     Raises:

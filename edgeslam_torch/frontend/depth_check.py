@@ -93,7 +93,7 @@ class CheckedDepth:
             self._agreement.append(0.0 if np.isnan(found) else found)
             if self._inside_out() and self._contradiction is None:
                 self._contradiction = (
-                    "the depth network takes for far what the shipped network takes for near: such depth is not used; "
+                    "the depth network exchanges near and far compared with the shipped one: its depth is not used; "
                     + self.depth.said_instead(image, camera, other)  # type: ignore[attr-defined]
                 )
                 logger.warning(self._contradiction)

@@ -259,7 +259,7 @@ def _try_out(engine: _Engine, weights: Path) -> None:
             raise WeightsError(f"{weights}: gives no depth: every pixel is not finite or at the end of its range")
         answers.append(log_depth)
     if np.array_equal(answers[0], answers[1], equal_nan=True):
-        raise WeightsError(f"{weights}: gives the same depth whatever it sees")
+        raise WeightsError(f"{weights}: gives the same depth for different images")
 
 
 class _OnnxEngine:

@@ -210,7 +210,7 @@ class ExternalDepth:
                 raise WeightsError(f"{self.weights}: gives no depth, if its numbers are {self.network.gives}")
             answers.append(given)
         if np.array_equal(answers[0], answers[1], equal_nan=True):
-            raise WeightsError(f"{self.weights}: gives the same depth whatever it sees")
+            raise WeightsError(f"{self.weights}: gives the same depth for different images")
 
 
 def _plane(array: FloatArray) -> FloatArray:

@@ -45,7 +45,7 @@ class RepeatedImages:
         first, last = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
         times = "" if len(stretches) == 1 else f" {len(stretches)} times, the longest"
         return (
-            f"the video stood still{times} from {first:.1f} to {last:.1f} s, the same image again and again: "
+            f"the video froze{times} from {first:.1f} to {last:.1f} s, the same image repeated: "
             "where the camera moved meanwhile is not known"
         )
 

@@ -29,9 +29,9 @@ class GyroscopeCheck:
     """Comparison of gyroscope and images."""
 
     fault: str = ""
-    """In one line; empty if they agree, or if too little turned to tell."""
+    """In one line; empty if they agree, or with too little rotation to decide."""
     known: bool = False
-    """Whether enough turned to tell."""
+    """Whether there was enough rotation to decide."""
     misfit: float = float("nan")
     """RMS difference of the rotations relative to their size, with the stated units and mount (or the best one, if
     none is stated)."""

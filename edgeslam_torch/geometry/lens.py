@@ -40,7 +40,9 @@ def check_camera(camera: Camera) -> None:
         )
     if unique_share(camera) < UNIQUE:
         numbers = ", ".join(f"{k:g}" for k in camera.distortion)
-        raise CalibrationError(f"distortion [{numbers}] cannot be a lens's: it folds the image or tears it apart")
+        raise CalibrationError(
+            f"distortion [{numbers}] cannot be a lens's: the distorted image folds over or has a gap"
+        )
 
 
 def unique_share(camera: Camera) -> float:

@@ -1,1 +1,1 @@
-"""What the command line says of its commands."""
+"""Descriptions of the commands for the command line."""

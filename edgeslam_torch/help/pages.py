@@ -1,4 +1,4 @@
-"""The list of commands by groups, and what a command's help says beside the options."""
+"""The list of commands by groups, and a command's help beside its options."""
 
 import argparse
 from collections.abc import Mapping

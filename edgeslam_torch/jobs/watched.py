@@ -214,7 +214,7 @@ def last_words(log: Path, code: int) -> str:
 
 
 def resident_mb(process: int) -> float | None:
-    """Resident memory of a process [MB]; None where the system does not tell."""
+    """Resident memory of a process [MB]; None where the system does not report it."""
     try:
         with open(f"/proc/{process}/statm", encoding="ascii") as file:
             pages = int(file.read().split()[1])

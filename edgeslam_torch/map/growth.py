@@ -1,6 +1,6 @@
 """Rescaling of distances stored with anchors and keyframes after a refinement changed the local scale.
 
-A window changes the scale by too little to matter. Telemetry that takes back a drift changes it by half and more:
+A window changes the scale by too little to matter. Telemetry that corrects a drift changes it by half and more:
 anchors would be looked for on the wrong pyramid level, and priors would pull back.
 """
 

@@ -2,7 +2,7 @@
 
 ORB finds corners on whole pixels of its pyramid, a third of a pixel off at the finest level and one at the coarsest.
 What an anchor's patch looked like in the earliest keyframe that sees it is found again to a twentieth of a pixel
-(`geometry/patches.py`), so that parallax tells depths several times better.
+(`geometry/patches.py`), so that parallax determines depths several times better.
 """
 
 from dataclasses import dataclass

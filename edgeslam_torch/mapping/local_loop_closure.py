@@ -24,7 +24,7 @@ RADIUS_PX = 30.0
 RATIO = 0.85
 """Maximum ratio of nearest to second nearest descriptor distance."""
 MIN_INLIERS = 15
-"""Number of shared anchors from which on two keyframes are covisible (`SlamMap.covisible`)."""
+"""Minimum number of matches explained by one pose: as many as make two keyframes covisible."""
 MIN_SHARE = 0.5
 """Minimum share of inliers: the majority of the matches."""
 MAX_TURN_RAD = np.deg2rad(30.0)
@@ -34,7 +34,7 @@ MAX_SHIFT = 0.35
 MAX_DRIFT_PX = 5.0
 """Drift above which the whole map is refined; below, tracking finds the anchors within its ``map_radius_px``."""
 MIN_SHARED = 15
-"""Number of shared anchors from which on two keyframes are covisible, as in `SlamMap.covisible`."""
+"""Minimum number of shared anchors of covisible keyframes, as in `SlamMap.covisible`."""
 
 
 def revisit_candidate(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:

@@ -117,7 +117,7 @@ def _entry(value: Any, path: Path, number: int) -> Entry:
     except (TypeError, ValueError, KeyError, AttributeError, RecursionError, MemoryError, zlib.error) as error:
         raise SourceError(f"{path}: line {number} is damaged ({error})") from error
     if not isinstance(entry, Entry):
-        raise SourceError(f"{path}: line {number} is no entry of a planner's record")
+        raise SourceError(f"{path}: line {number} is not an entry of a planner's record")
     return entry
 
 

@@ -130,7 +130,8 @@ def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[L
 def _remaining(lengths: list[float]) -> float:
     """Distance to the minimum that is expected after steps of these lengths, the last one first.
 
-    Robust weights make the convergence linear, and slow where depths are uncertain: a short step alone says little.
+    Robust weights make the convergence linear, and slow where depths are uncertain: a short step alone is not
+    convergence.
     """
     rate = max((lengths[0] / lengths[k]) ** (1.0 / k) for k in range(1, len(lengths))) if len(lengths) > 1 else 0.5
     return lengths[0] * max(1.0, rate / (1.0 - rate)) if rate < 1.0 else math.inf

@@ -124,7 +124,7 @@ def in_order(entries: Sequence[ImageEntry], name: str) -> tuple[list[ImageEntry]
         SourceError: If most images have the stamp of another one.
     """
     problems = [
-        Problem(str(entry.path), f"stamp {entry.stamp_s:g} is no time; image left out")
+        Problem(str(entry.path), f"stamp {entry.stamp_s:g} is not a time; image left out")
         for entry in entries
         if not abs(entry.stamp_s) <= MAX_STAMP_S
     ]

@@ -1,5 +1,6 @@
 """`open_source`: a recording, an image folder, a video or a live stream as frames with a camera."""
 
+import difflib
 import importlib
 import importlib.util
 import math
@@ -273,7 +274,10 @@ def _content(path: Path) -> _Content:
         raise SourceError(f"{error.filename or path}: {error.strerror or error}") from error
     if path.exists():
         raise SourceError(f"{path}: neither a file nor a folder")
-    raise SourceError(f"{path}: no such file or folder")
+    there = [other.name for other in path.parent.iterdir()] if path.parent.is_dir() else []
+    close = difflib.get_close_matches(path.name, there, n=1, cutoff=0.8)
+    hint = f"; did you mean {path.parent / close[0]}?" if close else ""
+    raise SourceError(f"{path}: no such file or folder{hint}")
 
 
 def _file_content(path: Path) -> _Content:
@@ -378,7 +382,7 @@ def _looks_like_sequence(folder: Path) -> bool:
 def _open_live(spec: str, camera: str | Path | None, telemetry: str | Path | None, max_frames: int | None) -> Source:
     """Open a live source, which needs sockets and (for a drone) the ``[drone]`` extra."""
     if telemetry is not None:
-        raise SourceError(f"{spec}: a live source brings its own telemetry; leave --telemetry away")
+        raise SourceError(f"{spec}: a live source brings its own telemetry; omit --telemetry")
     if importlib.util.find_spec("edgeslam_torch.readers.live") is None:
         raise SourceError(f"{spec}: this installation has no live sources")
     live = importlib.import_module("edgeslam_torch.readers.live")

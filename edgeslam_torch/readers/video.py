@@ -45,7 +45,7 @@ class Video:
         rate = capture.get(cv2.CAP_PROP_FPS)
         self.rate_hz = rate if math.isfinite(rate) and 0.0 < rate <= 1000.0 else ASSUMED_HZ
         self.rate_is_assumed = stamps_s is None and (path.suffix.lower() in _RAW or self.rate_hz != rate)
-        """Whether neither the file nor a list says when its frames were taken."""
+        """Whether neither the file nor a list has the times of its frames."""
         count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.count = int(count) if math.isfinite(count) and count > 0 else None
         ok, image = capture.read()

@@ -1,4 +1,4 @@
-"""What long work is at: a terminal's last line, redrawn twice a second; elsewhere a line every few seconds."""
+"""Progress of long work: the last line of a terminal, redrawn twice a second; elsewhere a line every few seconds."""
 
 import sys
 import threading
@@ -16,10 +16,10 @@ LINE_EVERY_S = 5.0
 _LONGEST_JOIN_S = 1.0
 """A thread that writes to a stopped terminal is not waited for."""
 _LEAST_RATE = 0.1
-"""A second; of slower work the time left says more."""
+"""[1/s]; for slower work only the remaining time is shown."""
 
 _open: "list[Progress]" = []
-"""Work within work: the innermost is shown."""
+"""Nested work: the innermost is shown."""
 
 
 class Progress:
@@ -28,7 +28,7 @@ class Progress:
     Args:
         what: Name of the work or of its first phase, such as "training".
         total: Expected count; None if unknown.
-        unit: What is counted, such as "frame"; empty if nothing is: the time it takes is shown then.
+        unit: What is counted, such as "frame"; if empty, the elapsed time is shown.
         done: Counted before, by another process; not part of the rate.
         shown: Whether to show anything; of several processes one does.
         redraw: Whether the output can redraw a line; whether it is a terminal by default.
@@ -74,11 +74,11 @@ class Progress:
         self._begin(what, total, unit, done)
 
     def advance(self, by: float = 1) -> None:
-        """Count."""
+        """Add to the count."""
         self._done += by
 
     def reach(self, done: float, total: float | None) -> None:
-        """The count and the total as they are now."""
+        """Set the count and the total."""
         self._done, self._total = done, total
 
     def downloaded(self, have: int, total: int) -> None:
@@ -91,9 +91,10 @@ class Progress:
         parts = [self._what] if self._what else []
         if self._unit:
             units = self._unit if self._unit == "MB" else f"{self._unit}s"
+            counted = self._unit if max(self._done, self._total or 0) == 1 else units
             number = ".1f" if self._unit == "MB" else ".0f"
             of = "" if self._total is None else f" of {self._total:{number}}"
-            parts += [f"{self._done:{number}}{of} {units}"]
+            parts += [f"{self._done:{number}}{of} {counted}"]
             rate = (self._done - self._first) / taken_s if taken_s > 0 else 0.0
             parts += [f"{rate:.1f} {units}/s"] if rate >= _LEAST_RATE else self._taken(taken_s)
             parts += (
@@ -104,11 +105,11 @@ class Progress:
         return ", ".join(part for part in (*parts, self.words()) if part)
 
     def _taken(self, taken_s: float) -> list[str]:
-        """The time it takes, where it can be redrawn: lines that differ in nothing else are not repeated."""
+        """Elapsed time, where the line can be redrawn: lines that differ in nothing else are not repeated."""
         return [_time(taken_s)] if self._redraw else []
 
     def show(self) -> None:
-        """Show where the work is, if that is due; the thread calls it."""
+        """Show the progress if an update is due; called by the thread."""
         if self._thread is None or _open[-1:] != [self]:
             return
         if self._redraw:
@@ -119,7 +120,7 @@ class Progress:
             self._console.flush()
 
     def close(self) -> None:
-        """Take it away."""
+        """Remove the line and stop the thread."""
         if self._thread is None or self._ended.is_set():
             return
         self._ended.set()

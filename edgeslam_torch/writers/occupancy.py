@@ -28,8 +28,8 @@ _CHUNK = 2000
 
 @dataclass(frozen=True, slots=True)
 class SightLines:
-    """Who saw what: the space between was free. What was not seen says nothing, so a wall without edges stays
-    unknown whatever lies behind it."""
+    """Which keyframe observed which point: the space between was free. Unobserved space stays unknown, so a
+    wall without edges stays unknown whatever lies behind it."""
 
     eye_w: FloatArray
     """``(L, 3)`` positions of the cameras [m]."""

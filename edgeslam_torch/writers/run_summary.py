@@ -119,7 +119,7 @@ def up_in_words(up: Up | None) -> dict[str, Any]:
 
 
 def vertical_text(up: Any) -> str:
-    """What a summary's ``up`` says of the world's z axis; nothing else is believed."""
+    """A summary's ``up`` for the world's z axis; other values are ignored."""
     match up:
         case {"source": str(source), "sigma_deg": int() | float() as sigma_deg} if source != "unknown":
             return f"z up by {source.replace('+', ' and ')}, sigma {sigma_deg:.1f} degrees"

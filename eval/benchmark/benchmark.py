@@ -96,7 +96,7 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
     Args:
         settings: What is run.
         out: Folder of the runs; those with the same code and settings that it holds are not repeated.
-        say: Told one line after every run.
+        say: Called with one line after every run.
 
     Raises:
         EvaluationError: If a named sequence is not there.
@@ -125,7 +125,7 @@ def conditions() -> dict[str, Any]:
 
 
 def asked(settings: BenchSettings) -> dict[str, Any]:
-    """What a record says of its settings."""
+    """Settings of a record, in words."""
     seeds, overrides = list(settings.seeds), list(settings.overrides)
     return {"seeds": seeds, "max_frames": settings.max_frames, "overrides": overrides}
 
@@ -144,7 +144,7 @@ def run_rows(
         folders: Recordings by the sequence's name.
         rows: ``section.key=value`` by the row's name, and a statement that its process executes first.
         out: Folder for the runs.
-        say: Told one line after every run.
+        say: Called with one line after every run.
 
     Returns:
         Runs of each row: sequence, seed, figures, what else `run_sequence` found, and why there is none.

@@ -61,7 +61,7 @@ def _unit_factor(truth_s: FloatArray, estimate_s: FloatArray) -> tuple[float, st
     Clocks that start at 0 overlap in any unit, so stamps that do overlap are still suspected when one list lasts
     more than 200 times as long as the other, unless both count from 1970 (they overlap by no accident then) or one
     holds a handful of poses at a like rate. When no unit makes them overlap, the two clocks start at different
-    times, and how long the lists last still tells the unit.
+    times, and the lists' durations still determine the unit.
     """
     span_t, span_e = truth_s[-1] - truth_s[0], estimate_s[-1] - estimate_s[0]
     ratio = span_e / span_t if span_t > 0 and span_e > 0 else 1.0

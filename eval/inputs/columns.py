@@ -35,7 +35,7 @@ POSITIONS = Columns(((0, None),), (1, 2, 3), None)
 
 
 def columns_by_name(names: Sequence[str]) -> Columns | None:
-    """Columns by the header's names; None if it names none of them, so that their number must tell.
+    """Columns by the header's names; None if it names none of them: then their number decides.
 
     Raises:
         EvaluationError: If only a part of them is named, or one twice.

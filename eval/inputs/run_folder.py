@@ -16,9 +16,9 @@ from edgeslam_torch.writers.ply import read_ply
 from edgeslam_torch.writers.run_summary import vertical_text
 
 _NUMBERS = ("stamp_s", "scale", "scale_sigma", "unit", "revision")
-"""Columns of ``status.csv`` that are read as numbers; empty where a run knows none."""
+"""Columns of ``status.csv`` that are read as numbers; empty where a run has none."""
 _SUPPORTED = frozenset({"initialised", "tracked", "relocalised"})
-"""Status of a frame whose pose rests on the map, in tables of version 0.1, which have no column that says so."""
+"""Status of a frame whose pose rests on the map, in tables of version 0.1, which have no column for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class RunFolder:
 
     @property
     def units(self) -> str:
-        """``metres`` or ``arbitrary``, as the run says; ``unknown`` when it does not (a bare trajectory)."""
+        """``metres`` or ``arbitrary``, as stated by the run; ``unknown`` when it states none (a bare trajectory)."""
         scale = self.summary.get("scale")
         return str(scale.get("units", "unknown")) if isinstance(scale, dict) else "unknown"
 

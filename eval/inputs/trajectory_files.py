@@ -161,7 +161,7 @@ def _from_columns(table: Table, columns: Columns, path: Path) -> Trajectory:
         odd = np.abs(norms - 1.0) > 0.05  # files with three decimals stay within 0.005
         if odd.mean() > 0.5:
             raise EvaluationError(
-                f"{path}: the last four numbers of a row are no unit quaternion (norm {np.median(norms):.3g}); "
+                f"{path}: the last four numbers of a row are not a unit quaternion (norm {np.median(norms):.3g}); "
                 "the order must be t x y z qx qy qz qw, or a header must name the columns"
             )
         if odd.any():
@@ -219,7 +219,7 @@ def _mount(sensor: Path) -> FloatArray | None:
         raise EvaluationError(f"{sensor}: T_BS, the sensor's pose on the body, cannot be read ({error})") from error
     R = T_b_s[:3, :3]
     if not np.isfinite(T_b_s).all() or np.abs(R @ R.T - np.eye(3)).max() > 0.01 or np.linalg.det(R) < 0:
-        raise EvaluationError(f"{sensor}: T_BS, the sensor's pose on the body, is no rotation and translation")
+        raise EvaluationError(f"{sensor}: T_BS, the sensor's pose on the body, is not a rotation and translation")
     return T_b_s
 
 
@@ -247,7 +247,7 @@ def _increasing(stamps_s: FloatArray, T: FloatArray, source: str, notes: list[st
 def _from_matrices(stamps_s: FloatArray, T: FloatArray, source: str, notes: list[str]) -> Trajectory:
     stamps_s, T = _finite(stamps_s, T, source, notes)
     if np.median(np.abs(np.linalg.det(T[:, :3, :3]) - 1.0)) > 0.05:
-        raise EvaluationError(f"{source}: the 3x3 parts are no rotations (determinant not 1)")
+        raise EvaluationError(f"{source}: the 3x3 parts are not rotations (determinant not 1)")
     T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
     stamps_s, T = _increasing(stamps_s, T, source, notes)
     return Trajectory(stamps_s, T, source, tuple(notes))

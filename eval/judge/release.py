@@ -34,7 +34,8 @@ COMMANDS = {
     "fly": "edgeslam fly goto 3 0 --drone sim://l_corridor:3 --fly --record flights/1",
     "replay": "edgeslam fly replay flights/1",
     "finetune": "edgeslam finetune recordings/7scenes_redkitchen --steps 40 --out tuned",
-    "export": "edgeslam export tuned/weights.safetensors --out model.onnx --int8 --calibrate recordings/tum_fr1_xyz",
+    "export": "edgeslam export --depth tuned/weights.safetensors --out model.onnx --int8 "
+    "--calibrate recordings/tum_fr1_xyz",
     "fleet": "edgeslam demo --record-only --flights 3 --world corridor --duration 2 --rate 15 --width 320 --out fleet",
     "batch": "edgeslam batch fleet --out batch",
 }
@@ -79,7 +80,7 @@ def release_record(rows: Sequence[Row], commit: str, outputs: dict[str, list[str
     """Medians and ranges of the release's runs with their conditions.
 
     Raises:
-        EvaluationError: If a run has no result, or the code is no commit: a release would state what nobody can repeat.
+        EvaluationError: If a run has no result, or the code is no commit: such a release would not be reproducible.
     """
     if "+" in commit:
         raise EvaluationError(f"the code has uncommitted changes ({commit}): a release is of a commit")

@@ -57,7 +57,7 @@ class RunScore:
     map_note: str
     """Why there is no map score."""
     units: str
-    """``metres`` or ``arbitrary``, as the run says; ``unknown`` for a bare trajectory."""
+    """``metres`` or ``arbitrary``, as stated by the run; ``unknown`` for a bare trajectory."""
     summary: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     """Findings of `explain`."""

@@ -172,7 +172,7 @@ def score_trajectory(
 
 
 def without_orientation(truth: Trajectory, estimate: Trajectory) -> Trajectory | None:
-    """The one of the two that does not tell how the camera is turned: it has positions alone, or one orientation for
+    """The one of the two without usable orientations: it has positions alone, or one orientation for
     all poses while the other one's camera turns."""
     for mine, other in ((truth, estimate), (estimate, truth)):
         if not mine.oriented or (_spread_deg(mine) < _TURNED_ALIKE_DEG and _spread_deg(other) > _TURNING_DEG):

@@ -29,7 +29,7 @@ def cached_graph(weights: Path) -> tuple[Path | bytes, Metadata]:
             content, _ = _built(weights)
             write_atomically(file, lambda out: out.write(content))
         return file, metadata
-    except (OSError, WeightsError):  # a cache that cannot be written; damaged weights, of which the builder says more
+    except (OSError, WeightsError):  # a cache that cannot be written; damaged weights, which the builder reports
         return _built(weights)
 
 

@@ -1,6 +1,6 @@
 """Depth networks of others as ONNX files: what goes in, and what comes out.
 
-The file may say so itself, in its property ``edgeslam.depth`` (JSON); otherwise a TOML file beside it says it.
+The description is in the file's property ``edgeslam.depth`` (JSON), otherwise in a TOML file beside it.
 """
 
 import json
@@ -121,7 +121,7 @@ def _description(model: onnx.ModelProto, path: Path) -> ExternalNetwork:
     own = next((p.value for p in model.metadata_props if p.key == PROPERTY), None)
     if own is None and not beside.is_file():
         raise WeightsError(
-            f"{path}: nothing says how to use this network; describe it in {beside.name} beside it "
+            f"{path}: this network has no description; write one in {beside.name} beside it "
             f"(gives = {' | '.join(repr(str(g)) for g in Gives)}, or preset = {' | '.join(map(repr, PRESETS))})"
         )
     try:
@@ -159,7 +159,7 @@ def _with_fixed_size(network: ExternalNetwork, model: onnx.ModelProto, path: Pat
     """The description with names and size of the graph's ends, checked against each other.
 
     Raises:
-        WeightsError: If the graph has other ends than the description says.
+        WeightsError: If the graph's inputs or outputs differ from the description.
     """
     constants = {tensor.name for tensor in model.graph.initializer}
     inputs = [value for value in model.graph.input if value.name not in constants]

@@ -30,7 +30,7 @@ RAY = ["--ray", "local"]
         (["flights", "--ray", "auto", "--jobs", "2"], "--jobs is for this machine"),
     ],
 )
-def test_mistakes_are_told_in_one_line(tmp_path, monkeypatch, write_images, capsys, arguments, message):
+def test_mistakes_are_reported_in_one_line(tmp_path, monkeypatch, write_images, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     write_images(tmp_path / "flights" / "a", ["0.png"])
     assert main(["batch", *arguments, "--out", "out"]) == 1

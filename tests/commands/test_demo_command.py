@@ -94,7 +94,7 @@ def test_demo_flight_meets_its_bars(tmp_path, world, scale_bar, ate_bar):
         (["--width", "641"], "--width must be"),
     ],
 )
-def test_wrong_options_are_told_in_one_line(tmp_path, capsys, arguments, message):
+def test_wrong_options_are_reported_in_one_line(tmp_path, capsys, arguments, message):
     assert main(["demo", "--out", str(tmp_path), *arguments]) == 1
     error = capsys.readouterr().err.strip()
     assert message in error

@@ -9,7 +9,7 @@ from edgeslam_torch.cli import main
 from edgeslam_torch.flying.keys import listen
 
 
-def test_a_dry_run_shows_the_plan_and_asks_nobody(capsys):
+def test_a_dry_run_shows_the_plan_and_contacts_nobody(capsys):
     assert main(["fly", "goto", "3", "-4", "--dry-run", "--back", "--speed", "0.25"]) == 0
     out = capsys.readouterr().out
     assert "5.0 m in a straight line, at least 20 s" in out

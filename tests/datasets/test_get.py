@@ -84,7 +84,7 @@ def test_recording_is_ready_to_run_and_says_where_it_comes_from(one, publisher, 
     assert publisher.agents == {USER_AGENT}, "some servers refuse Python's own"
 
 
-def test_second_call_asks_nobody(one, publisher, tmp_path, capsys):
+def test_a_second_call_needs_no_consent(one, publisher, tmp_path, capsys):
     one(tum())
     assert get(tmp_path, "tum_fr1_a") == 0
     publisher.requests.clear()
@@ -108,7 +108,7 @@ def test_broken_download_goes_on_in_the_next_call(one, publisher, tmp_path, caps
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(store, "fetch", vanish)
         assert get(tmp_path, "tum_fr1_a") == 1
-    assert "the same command goes on" in capsys.readouterr().err
+    assert "run the same command to resume" in capsys.readouterr().err
     assert part.stat().st_size == 1000
     assert not (tmp_path / "rec" / "tum_fr1_a").exists()
     publisher.files["/a.tgz"] = content
@@ -140,7 +140,7 @@ def test_wrong_checksum_leaves_nothing(one, tmp_path, capsys, algorithm):
     one(tum(), checksum=wrong, checksum_by="publisher")
     assert get(tmp_path, "tum_fr1_a") == 1
     error = capsys.readouterr().err.strip()
-    assert "not the file that it should be; it was deleted" in error
+    assert "not the expected file; it was deleted" in error
     assert "\n" not in error
     assert list((tmp_path / "rec" / ".downloads").iterdir()) == []
 
@@ -177,7 +177,7 @@ def test_first_download_is_trusted_and_a_changed_second_one_is_not(one, publishe
     target.rename(tmp_path / "rec" / "aside")
     publisher.files["/a.tgz"] = tum(5)
     assert get(tmp_path, "tum_fr1_a") == 1
-    assert "not the file that it should be" in capsys.readouterr().err
+    assert "not the expected file" in capsys.readouterr().err
     assert not target.exists()
 
 

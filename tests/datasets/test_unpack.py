@@ -78,7 +78,7 @@ def test_link_in_a_zip_is_refused(put):
 
 
 def test_bomb_is_refused_before_it_is_unpacked(put, tmp_path):
-    with pytest.raises(SourceError, match="that is no recording"):
+    with pytest.raises(SourceError, match="too much for a recording"):
         put(tgz({"rgb.txt": bytes(40 << 20)}))
     assert list((tmp_path / "target").iterdir()) == []
 

@@ -50,7 +50,7 @@ def emulate():
         emulator.stop()
 
 
-def test_a_drone_that_was_restarted_is_asked_for_state_and_video_again(emulate):
+def test_state_and_video_of_a_restarted_drone_are_requested_again(emulate):
     emulator, address = emulate()
     with Tello(address) as tello:
         tello.connect(PATIENCE_S)
@@ -203,7 +203,7 @@ def lose(emulator, command, count):
     return lost
 
 
-def test_a_landing_that_is_not_heard_is_asked_for_again(emulate, monkeypatch):
+def test_a_lost_landing_command_is_repeated(emulate, monkeypatch):
     monkeypatch.setattr(tello_module, "_LAND_AGAIN_S", 0.5)
     emulator, address = emulate()
     with Tello(address, allow_motion=True) as tello:

@@ -424,7 +424,7 @@ def test_validated_velocities_without_a_scale_are_reported():
     trust.judge(Reading.VELOCITY, Agreement(0.8, 12))
     assert trust.warnings() == []
     trust.tells_scale = False
-    assert any("too badly to tell a scale" in w for w in trust.warnings())
+    assert any("too badly to determine a scale" in w for w in trust.warnings())
 
 
 def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, replay):

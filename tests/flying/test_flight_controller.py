@@ -68,7 +68,7 @@ def test_a_hand_on_the_keyboard_holds_it_and_lets_go(flight_controller):
     assert flight_controller.order(state(0.15)).command == AHEAD
 
 
-def test_a_pilot_knows_that_its_wish_was_not_followed(flight_controller):
+def test_the_state_reports_an_overridden_command(flight_controller):
     told = []
     flight_controller.pilot.update = lambda state: told.append(state.overridden) or AHEAD
     for held in (False, True, False):

@@ -75,7 +75,7 @@ def test_a_picture_with_too_few_points_goes_by_the_last_fit(perception):
     assert told(perception, 5.1, "tracking") is None
 
 
-def test_a_picture_whose_points_are_in_another_unit_goes_by_the_usual_metre(perception):
+def test_points_in_another_unit_do_not_change_the_depth_bias(perception):
     """After a turn on the spot a new piece of map is 3 times as large as it says."""
     perception._unit = 3, 1.0
     for k in range(20):
@@ -89,7 +89,7 @@ def test_a_picture_whose_points_are_in_another_unit_goes_by_the_usual_metre(perc
     assert perception._bias.doubt == pytest.approx(2.0, rel=0.05)
 
 
-def test_what_is_usual_bridges_pictures_without_points_as_long_as_the_unit_lasts(perception):
+def test_depth_bias_bridges_pictures_without_points_until_the_unit_changes(perception):
     perception._unit = 3, 1.0
     for k in range(20):
         told(perception, 1.0 + 0.2 * k, "tracking")
@@ -140,7 +140,7 @@ def test_depth_is_that_of_the_picture_without_the_lens(perception):
     assert (seen[0] != bare_wall()).any()
 
 
-def test_a_fit_that_is_old_or_in_another_unit_tells_nothing(perception):
+def test_a_fit_that_is_old_or_in_another_unit_is_ignored(perception):
     assert told(perception, 0.5, "lost") is None  # none yet
     told(perception, 1.0, "tracking")
     assert told(perception, 2.0, "lost", revision=4) is None
@@ -243,7 +243,7 @@ class Slam:
         self.closed = True
 
 
-def test_a_map_that_tells_no_metres_in_the_air_is_given_up_for_a_new_one(monkeypatch):
+def test_a_map_without_metric_scale_in_flight_is_reset(monkeypatch):
     monkeypatch.setattr("edgeslam_torch.flying.perception.slam_perception.EdgeSlam", Slam)
     Slam.made.clear()
     perception, revisions = SlamPerception(CAMERA), []

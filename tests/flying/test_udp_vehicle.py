@@ -86,7 +86,7 @@ def flight(monkeypatch):
             vehicle.close()
 
 
-def test_eyes_know_the_attitude_before_the_first_picture_and_look_fifteen_times_a_second(flight):
+def test_perception_has_attitude_before_the_first_picture_and_runs_at_15_hz(flight):
     _, vehicle, _ = flight
     perception = vehicle._perception
     assert threading.current_thread() in perception.told_by, "while they were opened: the next message may be late"

@@ -173,5 +173,5 @@ def test_weights_without_depth_are_rejected_on_loading(tmp_path, backend):
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
 def test_weights_with_constant_output_are_rejected_on_loading(tmp_path, backend):
-    with pytest.raises(WeightsError, match="the same depth whatever it sees"):
+    with pytest.raises(WeightsError, match="the same depth for different images"):
         DepthPredictor(changed(tmp_path, decode_conv6__0__weight=0.0, decode_conv6__1__bias=1.0), backend)

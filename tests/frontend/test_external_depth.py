@@ -108,7 +108,7 @@ def test_input_fits_the_image_in_multiples_of_the_networks_patches(tmp_path):
 # -- one line ------------------------------------------------------------------------------------------------------
 
 BAD = {
-    "nothing says": None,
+    "no description": None,
     "gives must be one of": "input_width = 192\n",
     "unknown key 'gife'": f'gives = "metres"\ngife = 1\n{SIZE}',
     "multiples of 14": f'gives = "metres"\nmultiple = 14\n{SIZE}',
@@ -149,7 +149,7 @@ ROWS = {"nodes": [node("Reshape", "depth rows", "out")], "output": "out"}
         ({**ROWS, "constants": {"rows": np.array([1, 1, 126, -1])}}, SIZE, "cannot be run on 112x112 pixels"),
         (always(np.nan), SIZE, "gives no depth"),
         (always(-9.0), SIZE, "gives no depth"),
-        (always(2.0), SIZE, "the same depth whatever it sees"),
+        (always(2.0), SIZE, "the same depth for different images"),
     ],
 )
 def test_network_that_cannot_give_depth_is_one_line(tmp_path, network, text, words):

@@ -74,7 +74,7 @@ def test_uncertainty_is_best_at_the_mean_absolute_residual():
     assert at[1] == min(at)
 
 
-def test_slope_tells_a_squeezed_range_and_not_a_wrong_scale():
+def test_slope_detects_a_compressed_range_and_not_a_wrong_scale():
     near_and_far = torch.tensor([0.0, 0.0, 2.0, 2.0]).view(1, 1, 2, 2)  # variance 1
     mask = torch.ones_like(near_and_far, dtype=torch.bool)
     term = LogSlope(floor=0.25)

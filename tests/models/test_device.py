@@ -117,7 +117,7 @@ def test_onnxruntime_is_asked_for_the_device(device, built_in, asked, monkeypatc
     assert log == [asked]
 
 
-def test_onnxruntime_that_falls_back_silently_is_told(monkeypatch, caplog):
+def test_a_silent_fallback_of_onnxruntime_is_reported(monkeypatch, caplog):
     """CUDA is built in, its libraries are missing: onnxruntime goes on with the processor and says nothing."""
     onnxruntime_with(monkeypatch, CUDA, CPU, usable=CPU)
     with pytest.raises(ConfigError, match=r"cannot use CUDA here .* use --device cpu"):

@@ -127,7 +127,7 @@ def test_step_counters_may_be_missing(file, tmp_path):
         (lambda f: f.replace("conv3.0.weight", "I64", [16, 1, 3, 3], bytes(1152)), "holds I64 numbers"),
         (lambda f: f.replace("conv3.0.weight", "F8_E4M3", [16, 1, 3, 3], bytes(144)), "holds 'F8_E4M3' numbers"),
         (lambda f: f.replace("conv0.1.num_batches_tracked", "F32", [], bytes(4)), "holds F32 numbers, not I64"),
-        (lambda f: f.header.update({"conv2.3.weight": f.header["conv3.3.weight"]}), "lies over another tensor"),
+        (lambda f: f.header.update({"conv2.3.weight": f.header["conv3.3.weight"]}), "overlaps another tensor"),
         (lambda f: f.record(variant="mobilenet-nnconv5"), "does not fit mobilenet-nnconv5: no parameter"),
         (lambda f: f.array("conv0.0.weight").__setitem__(-1, np.nan), "conv0.0.weight holds values that are not"),
         (lambda f: f.array("conv7.1.running_mean").__setitem__(0, np.inf), "running_mean holds values that are not"),

@@ -250,7 +250,7 @@ def test_a_jump_of_the_pose_is_no_way_through():
     ("case", "x", "y", "yaw_deg"),
     [("along the wall", 1.4, -1.6, 68.0), ("from afar", -0.7, 0.0, 0.0), ("elsewhere", 0.6, 0.0, 30.0)],
 )
-def test_looks_that_see_nothing_of_an_exit_do_not_speak_against_it(case, x, y, yaw_deg):
+def test_views_that_do_not_cover_an_exit_do_not_lower_its_odds(case, x, y, yaw_deg):
     """A door beside the corridor, seen at a grazing angle while passing it."""
     watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     for k in range(20):
@@ -258,7 +258,7 @@ def test_looks_that_see_nothing_of_an_exit_do_not_speak_against_it(case, x, y, y
     assert len(watch.exits) == 1, case
 
 
-def test_a_look_at_what_is_open_in_part_does_not_speak_against_it():
+def test_views_of_a_partly_open_door_do_not_lower_its_odds():
     watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     for k in range(20):
         watch.look(smeared(), state(0.6, stamp_s=5.0 + 0.5 * k))
@@ -299,7 +299,7 @@ def test_pillars_are_no_exit_once_their_surroundings_are_seen():
     assert not watch.exits
 
 
-def test_ten_seconds_that_know_a_way_round_outvote_what_did_not_know_it_yet():
+def test_ten_seconds_with_a_detour_outweigh_views_without_one():
     """A gap beside a cupboard, seen from behind it only."""
     door, pillars = surroundings(wall(0.9)), surroundings(PILLARS)
     watch = watched([0.0, 0.2, 0.4, 0.6] * 20, door)
@@ -445,7 +445,7 @@ def test_exits_go_along_with_the_map():
     assert exit_.width_m == pytest.approx(1.17, abs=0.2)
 
 
-def test_a_revised_unit_forgets_exits_if_no_view_says_where_they_went():
+def test_a_revised_unit_drops_exits_without_a_view():
     pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
     pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     pilot.update(state(0.0, stamp_s=9.0))
@@ -456,7 +456,7 @@ def test_a_revised_unit_forgets_exits_if_no_view_says_where_they_went():
     assert pilot.exits.exits == ()
 
 
-def test_a_revised_unit_keeps_exits_that_a_view_carries_along():
+def test_a_revised_unit_keeps_exits_tied_to_a_view():
     pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
     pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)), pilot.views)
     pilot.update(state(0.0, stamp_s=9.0))
@@ -479,7 +479,7 @@ def test_the_pilot_takes_what_is_low_for_no_wall():
     assert walls.upright[first] and not walls.upright[second]
 
 
-def test_the_pilot_tells_its_skill_of_candidates(monkeypatch):
+def test_the_pilot_passes_candidates_to_its_skill(monkeypatch):
     monkeypatch.setattr(Pilot, "walls", lambda self: surroundings(wall(0.9)))
     task = Explore()
     pilot = Pilot(task)
@@ -490,7 +490,7 @@ def test_the_pilot_tells_its_skill_of_candidates(monkeypatch):
     assert len(task.goals(surroundings(wall(0.9)).layer, state(-1.0, stamp_s=9.2)))
 
 
-def test_the_pilot_tells_its_skill_of_exits(monkeypatch):
+def test_the_pilot_passes_exits_to_its_skill(monkeypatch):
     monkeypatch.setattr(Pilot, "walls", lambda self: surroundings(wall(0.9)))
     told = []
 

@@ -68,7 +68,7 @@ def walled_with_gap(cells, other=None, first=30):
 
 
 @pytest.mark.parametrize(("cells", "narrow_m", "leads_on"), [(3, 0.12, True), (2, 0.12, False), (3, math.inf, False)])
-def test_a_gap_narrower_than_asked_is_worth_a_look_if_a_hull_passes(cells, narrow_m, leads_on):
+def test_a_gap_below_the_clearance_is_viewed_if_the_hull_fits(cells, narrow_m, leads_on):
     layer = walled_with_gap(cells)
     plan = cost_to_go(layer, np.array([[50, 31]]), 0.27, np.array([10, 31]), narrow_m=narrow_m)
     assert math.isfinite(plan.at(np.array([1.05, 3.15]))) == leads_on

@@ -178,7 +178,7 @@ def test_viewpoints_before_an_opening_on_the_way_come_first():
     assert far.tolist() != planner.goals(room(), beside(1.2, -0.5), far)[:1].tolist()
 
 
-def test_viewpoints_are_before_an_opening_and_away_from_those_that_told():
+def test_viewpoints_are_before_an_opening_and_away_from_earlier_ones():
     places, planner = wanted(considering(DOOR), room()), considering(DOOR)
     assert len(places)
     for place in places:
@@ -199,7 +199,7 @@ def test_unreachable_viewpoints_are_excluded():
     assert np.abs(wanted(considering(DOOR), table) - [1.3, 0.0]).max(1).min() > 0.3
 
 
-def test_it_stands_and_looks_at_an_opening_until_no_view_tells_more():
+def test_it_hovers_and_views_an_opening_until_views_add_no_information():
     planner = considering(DOOR)
     assert planner.heading_rad(beside(1.5, 1.0)) is None, "from where it was seen"
     assert planner.heading_rad(beside(1.8, -0.3, 1.0)) == pytest.approx(math.atan2(0.3, 1.2))

@@ -83,7 +83,7 @@ def test_the_papers_pixel_cycle_is_measured_in_pixels():
     assert with_scales(pixel, term_sigmas({})).edges.cycle_sigma == pytest.approx(SCALES["edge"][0])
 
 
-def test_a_scale_is_drawn_to_its_usual_value_clamped_and_unmoved_by_few():
+def test_a_scale_is_shrunk_to_its_prior_clamped_and_unchanged_by_few_residuals():
     usual = term_sigmas({})
     assert usual == pytest.approx({name: scale[0] for name, scale in SCALES.items()})
     assert term_sigmas({"edge": np.full(10, 9.0)}) == usual

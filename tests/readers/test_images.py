@@ -122,7 +122,7 @@ def test_a_file_too_large_for_an_image_is_not_read(tmp_path):
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_sixteen_bits_keep_their_contrast_and_are_said_once(tmp_path, channels):
+def test_sixteen_bits_keep_their_contrast_and_are_reported_once(tmp_path, channels):
     grey = np.arange(80 * 60).reshape(60, 80) % 251
     deep = (7000 + np.repeat(grey[..., None], channels, axis=2)).astype(np.uint16)
     entries = [ImageEntry(i, i / 10, tmp_path / f"{i}.png") for i in range(15)]

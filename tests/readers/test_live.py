@@ -68,7 +68,7 @@ def test_device_is_given_back_when_the_taker_stops_early():
     assert feed.closed == 1
 
 
-def test_a_source_that_is_told_to_end_ends_while_it_waits():
+def test_a_source_that_is_ended_stops_while_it_waits():
     feed = FakeFeed([1, 2])
     source = LiveSource("webcam:0", feed, [], None, None, is_drone=False)
     wait = feed.wait

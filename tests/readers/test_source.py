@@ -319,3 +319,9 @@ def test_an_imu_beside_the_images_is_used_unless_the_user_says_otherwise(tmp_pat
     assert own.part(3, 1).imu_readings.stamps_s[0] >= 99.3
     with pytest.raises(SourceError, match="gone"):
         open_source(folder, imu=tmp_path / "gone.csv")
+
+
+def test_a_mistyped_name_is_answered_with_the_one_that_is_there(tmp_path):
+    (tmp_path / "tum_fr1_xyz").mkdir()
+    with pytest.raises(SourceError, match=r"no such file or folder; did you mean .*tum_fr1_xyz\?"):
+        open_source(tmp_path / "tum_fr1_xy")

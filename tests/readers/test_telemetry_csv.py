@@ -126,7 +126,7 @@ def test_any_clock_may_state_its_unit(tmp_path, clock, unit_s):
         ("yaw_rad", 0.05, False),
     ],
 )
-def test_numbers_that_no_tello_sends_are_said_to_have_no_unit(tmp_path, header, value, said):
+def test_implausible_numbers_are_reported_as_without_a_unit(tmp_path, header, value, said):
     path = write(tmp_path, f"stamp_s,{header}\n" + "".join(f"{i / 10},{value}\n" for i in range(40)))
     assert any("unit" in warning for warning in read_telemetry(path)[1]) is said
 
@@ -174,7 +174,7 @@ def test_unit_and_axis_of_the_velocity_are_found_from_height(tmp_path, velocity_
 
 
 @pytest.mark.filterwarnings("error")
-def test_height_that_never_changes_tells_no_unit(tmp_path):
+def test_a_constant_height_determines_no_unit(tmp_path):
     rows = [f"{100 * k},0,0,{2 + k % 3},100" for k in range(100)]
     table = read_table(write(tmp_path, "\n".join(["timestamp,vx,vy,vz,tof", *rows]) + "\n"))
     assert "too little vertical motion" in detect_units(table).evidence
@@ -381,7 +381,7 @@ def test_clocks_that_begin_anew_and_dates_are_read(tmp_path, times, seconds):
     assert len(table.stamps_s) == len(times)
 
 
-def test_stamps_in_another_unit_than_their_name_says_are_said(tmp_path):
+def test_stamps_in_another_unit_than_their_name_are_reported(tmp_path):
     rows = "".join(f"{100 * k},{k}\n" for k in range(20))
     samples, said = read_telemetry(write(tmp_path, f"stamp_s,yaw\n{rows}"))
     assert samples[-1].stamp_s == pytest.approx(1.9)

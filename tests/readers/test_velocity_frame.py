@@ -25,7 +25,7 @@ def turned_to_body(values):
     return {**values, "vgx": c * x + s * y, "vgy": -s * x + c * y}
 
 
-def test_both_frames_are_told_apart_by_the_lean(rng):
+def test_both_frames_are_distinguished_by_the_lean(rng):
     t, values = flown(rng)
     assert body_frame_evidence(t, values)[0] < -20
     assert body_frame_evidence(t, turned_to_body(values))[0] > 20
@@ -71,7 +71,7 @@ def test_real_tellos_report_world_velocities(data_dir, name):
 @pytest.mark.data
 @pytest.mark.parametrize("lean_deg", [0.0, -23.0])
 @pytest.mark.parametrize("name", ["flight_a", "flight_b"])
-def test_real_flights_told_in_body_axes_or_leaning_are_told_apart(data_dir, name, lean_deg):
+def test_real_flights_in_body_or_leaning_axes_are_distinguished(data_dir, name, lean_deg):
     table = read_table(data_dir / "tello_telemetry" / f"{name}.csv")
     values = {**table.values, "pitch": table.values["pitch"] + lean_deg}
     assert body_frame_evidence(table.stamps_s, values)[0] < -15

@@ -49,6 +49,7 @@ def test_a_line_every_five_seconds_where_there_is_no_terminal():
     shown = lines(40, 0, 1.0)
     assert len(shown) == 8
     assert shown[0] == "edgeslam: training, 5 of 40 steps, 1.0 steps/s, 35 s left, loss 4"
+    assert "1 of 1 step, " in lines(1, 0, 5.0)[0]
 
 
 def test_what_was_done_before_is_no_part_of_the_rate():
@@ -132,7 +133,7 @@ def test_counted_gives_the_items():
     assert list(counted(["a", "b"], "reading", "image")) == ["a", "b"]
 
 
-def test_downloads_are_told_in_megabytes():
+def test_downloads_are_shown_in_megabytes():
     clock = Clock()
     with Progress("file", unit="MB", stream=io.StringIO(), clock=clock) as progress:
         clock.now += 2.0
@@ -142,7 +143,7 @@ def test_downloads_are_told_in_megabytes():
         assert progress.text() == "file, 3.0 MB, 1.5 MB/s"
 
 
-def test_a_run_tells_frames_pose_way_and_the_last_refinement():
+def test_a_run_shows_frames_pose_distance_and_the_last_refinement():
     slam, image = FakeSlam(), np.full((4, 4), 9, np.uint8)
     with RunProgress("opening") as progress:
         for i in range(3):

@@ -172,7 +172,7 @@ def test_more_steps_go_on_where_fewer_ended(tmp_path):
     state = run(tmp_path, replace(CONFIG, steps=9))
     assert state.step == 9
     assert [row["step"] for row in state.history] == [3, 6, 9]
-    with pytest.raises(ConfigError, match="has 9 steps behind it"):
+    with pytest.raises(ConfigError, match="has 9 steps already"):
         run(tmp_path, replace(CONFIG, steps=8))
 
 

@@ -33,7 +33,7 @@ def densify(log_depth: FloatArray, uv: FloatArray, log_z: FloatArray) -> FloatAr
         sigma = scale * width
         rest = np.zeros((height, width), np.float32)
         np.add.at(rest, (v, u), ratio - correction[v, u])
-        # A point's share in the middle of its own Gaussian is 1 / (2 pi sigma^2): in these units doubt is in points.
+        # A point's share in the middle of its own Gaussian is 1 / (2 pi sigma^2): uncertainty in points.
         weight = cv2.GaussianBlur(count, (0, 0), sigma) + doubt / (2 * np.pi * sigma**2)
         correction = correction + cv2.GaussianBlur(rest, (0, 0), sigma) / weight
     return log_depth + correction

@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 IMAGES = ("jpg", "jpeg", "png")
 DEPTHS = ("depth.png", "depth.npy")
 DEPTH_PER_M = 1000.0
-"""Of a depth.png whose json says nothing else."""
+"""Default for a depth.png whose json has no ``depth_per_m``."""
 TAIL = 64
 """Number of bytes at the end of each file that are compared to detect changes."""
 _UNREADABLE = (OSError, ValueError, IndexError, OverflowError, MemoryError, RecursionError, cv2.error)
@@ -190,7 +190,7 @@ def _decoded(sample: _Sample) -> View:
     content = {kind: sample.read(kind) for kind in (image_kind, depth_kind, "json")}
     record = json.loads(content["json"])
     if not isinstance(record, dict):
-        raise ValueError("json: no table")
+        raise ValueError("json: not a table")
     _check_size(content[image_kind], image_kind)
     image = cv2.imdecode(np.frombuffer(content[image_kind], np.uint8), cv2.IMREAD_COLOR)
     if image is None:
@@ -202,7 +202,7 @@ def _decoded(sample: _Sample) -> View:
     height, width = image.shape[:2]
     allowed = FOCAL_RANGE[0] * width <= min(fx, fy) and max(fx, fy) <= FOCAL_RANGE[1] * width
     if not (allowed and -width <= cx <= 2 * width and -height <= cy <= 2 * height):
-        raise ValueError("fx, fy, cx, cy are no calibration")
+        raise ValueError("fx, fy, cx, cy are not a calibration")
     return View(np.asarray(image, np.uint8), depth_m, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
 
 

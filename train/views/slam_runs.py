@@ -30,7 +30,7 @@ def ensure_run(
 
     Args:
         recording: Folder or video file.
-        out: Folder of the run; ``out.json`` beside it says what it was made from.
+        out: Folder of the run; ``out.json`` beside it records its inputs.
         weights: Of the depth network; the shipped ones when None.
         camera: Calibration file or preset; the recording's own when None.
         max_frames: Use only the first frames.
@@ -39,7 +39,7 @@ def ensure_run(
     Raises:
         SourceError: If the recording cannot be read.
         OutputError: If the run could not be written.
-        KeyboardInterrupt: If the user stopped it; the next call begins anew.
+        KeyboardInterrupt: If the user stopped it; the next call starts again.
     """
     made_from = {
         "recording": signature(recording, apart),

@@ -31,7 +31,7 @@ class Signals:
         return 128 + self.number if self.number else 0
 
     def tell(self, end: Callable[[], None] | None, patient: bool) -> None:
-        """Call ``end`` on a signal instead of interrupting: always if ``patient``, else once; None to interrupt."""
+        """Call ``end`` on a signal instead of interrupting: every time if ``patient``, else once; None interrupts."""
         self._end, self._patient = end, patient
 
     def __enter__(self) -> "Signals":

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--cells",
         choices=CELLS,
         default="base",
-        help="recordings as they are, their variants, simulations, a made telemetry or IMU, or all (default: base)",
+        help="recordings as they are, their variants, simulations, simulated telemetry or IMU, or all (default: base)",
     )
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of every cell (default: 1)")
     parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="of those runs (default: 0)")
@@ -67,7 +67,7 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError("--release runs its own cells with default settings: omit --only, --set and --max-frames")
     if args.release is not None:
         cells = release_cells(data)
-        say(f"release: {len(cells)} runs; call it again to go on where it was interrupted")
+        say(f"release: {len(cells)} runs; call it again to resume after an interruption")
     else:
         cells = list_cells(data, args.cells, range(args.first_seed, args.first_seed + args.seeds), args.only)
     settings = JudgeSettings(tuple(args.set), args.max_frames, args.jobs, args.timeout, args.flights)

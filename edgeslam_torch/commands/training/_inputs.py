@@ -342,5 +342,5 @@ def labelled_folder(path: Path, width: int = 400, max_frames: int | None = None)
 def _left(out: "OutFolder") -> str:
     """Message after an interrupt."""
     if step := out.step:
-        return f"{out.path} holds step {step}, and the same command goes on from there"
+        return f"{out.path} holds step {step}, and the same command resumes from there"
     return "no step was saved"

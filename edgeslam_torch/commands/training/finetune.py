@@ -92,7 +92,7 @@ def _finetune(
     for line in data.describe():
         say(line)
     if not args.overwrite and 0 < (step := out.step) < args.steps:
-        say(f"{out.path}: goes on after step {step}")
+        say(f"{out.path}: resumes after step {step}")
     return finetune(network, metadata, data, config, out, from_runs, reading, hooks, args.cache)
 
 

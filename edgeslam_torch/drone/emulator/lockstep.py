@@ -125,7 +125,7 @@ class LockstepTello:
             ValueError: If ``seconds`` is not a positive number.
         """
         if not 0 < seconds < 3600:
-            raise ValueError(f"time passes by more than 0 s and less than an hour, not by {seconds}")
+            raise ValueError(f"a step must be longer than 0 s and shorter than an hour, got {seconds} s")
         until_s = self.clock_s + seconds
         arrived: list[Event] = []
         while (self._steps + 1) * _STEP_S <= until_s + 1e-9:

@@ -1,4 +1,4 @@
-r"""Metric scale from velocities or heights, in a map whose scale may wander as much as the residuals say.
+r"""Metric scale from velocities or heights, in a map whose scale may drift as much as the residuals show.
 
 Unknowns are :math:`\theta = (s, s\,\delta)`: metres per map unit and a small rotation of the map against the drone's
 world. Both kinds of measurement are linear in them:
@@ -40,7 +40,7 @@ _MIN_HEIGHTS = 4
 _BELIEF = 20.0
 """Weight of the expected noise against the observed one, in residuals."""
 _SELECTED_AT = 2
-"""Iteration in which the map's wander is selected: by then the worst outliers are downweighted."""
+"""Iteration in which the map's scale drift is selected: by then the worst outliers are downweighted."""
 _MOST_PARTS = 4
 """Maximum number of parts of a flight whose scales are compared; shorter parts are too noisy."""
 _VIEW_RAD = math.radians(60.0)
@@ -96,7 +96,7 @@ class Evidence:
         return s, math.sqrt(float(covariance[_SCALE, _SCALE])) / s
 
     def belief(self, source: str, tilt_sigma_rad: float | FloatArray, systematic: float) -> ScaleBelief | None:
-        """What it tells of the scale, with a relative systematic error; None where that is hardly anything."""
+        """The scale with a relative systematic error added; None where it is hardly determined."""
         rough = self.solved(tilt_sigma_rad)
         found = None if rough is None else self.softened(systematic * rough[0]).solved(tilt_sigma_rad)
         if found is None or found[1] >= _MOST_SIGMA:

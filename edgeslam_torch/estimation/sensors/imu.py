@@ -55,7 +55,7 @@ class Imu:
         self.fault = ""
         """Why readings and images do not move together; empty if they do."""
         self.forces: list[ImuReadings] = []
-        """Readings of an accelerometer without a gyroscope, which only tell the vertical."""
+        """Readings of an accelerometer without a gyroscope, which determine the vertical only."""
         self._parts: list[ImuReadings] = []
         self._mount: tuple[FloatArray, float] | None = None
         if model.T_imu_cam is not None and model.time_offset_s is not None:

@@ -307,8 +307,8 @@ class SensorGate:
             said.append(f"telemetry's velocities are not used: {_why(velocity, 'motion')}")
         if velocity is not None and self.velocity and not self.tells_scale and velocity.count >= _TO_CONTRADICT:
             said.append(
-                f"telemetry's velocities fit the images too badly to tell a scale ({100 * velocity.share:.0f} % of the "
-                "motion explained) and are not used"
+                f"telemetry's velocities fit the images too badly to determine a scale ({100 * velocity.share:.0f} % "
+                "of the motion explained) and are not used"
             )
         for reading in HEIGHTS:
             height = self.latest.get(reading)
@@ -321,12 +321,12 @@ def _deviation(found: Agreement) -> str:
     """Size of the deviation between attitude and images."""
     if not found.broken:
         return f"roll, pitch and yaw explain {100 * found.share:.0f} % of the turns in the images"
-    return f"{', '.join(found.broken)}: other turns than in the images (frozen, jumping, of the wrong sign?)"
+    return f"{', '.join(found.broken)}: differs from the rotation in the images (frozen, jumping, of the wrong sign?)"
 
 
 def _why(found: Agreement, motion: str) -> str:
     if found.broken:
-        return f"{', '.join(found.broken)}: another motion than in the images (frozen, jumping, of the wrong sign?)"
+        return f"{', '.join(found.broken)}: differs from the motion in the images (frozen, jumping, of the wrong sign?)"
     if found.count < (_EARLY_COUNT if found.early else LEAST_COUNT):
         return f"too little {motion} in common with the images to compare"
     if found.steady >= _EVEN and found.correlation < _DOUBTFUL[found.dimensions]:

@@ -110,7 +110,7 @@ def camera_of(record: dict[str, Any], source: str, size: tuple[int, int] | None)
     if family == lens_models.FOV and "omega" in stated:
         D = [_number("omega", stated["omega"])]
     elif not _is_zero(stated.get("omega", 0)):
-        raise CalibrationError("an angle of view is read of fov lenses only; state fx and fy")
+        raise CalibrationError("an angle of view is supported for fov lenses only; state fx and fy")
     if not D and family == lens_models.FISHEYE:
         raise CalibrationError("it states a fisheye lens, and no distortion coefficients; write four, zeros included")
     if not D and family not in (lens_models.PINHOLE, lens_models.NO_LENS):

@@ -1,6 +1,6 @@
 """Depth of edge pixels by a search along the epipolar lines of several keyframes, within a depth prior.
 
-The depth network (or the anchors around a pixel) says roughly how deep an edge is; where exactly is measured, as in
+The depth network (or the anchors around a pixel) gives a rough depth of an edge; the exact one is measured, as in
 semi-dense mapping (Engel et al., ICCV 2013; Mur-Artal and Tardos, RSS 2015), by comparing the grey profile across
 the edge with what the other keyframes show at each hypothesis: first coarsely, in smoothed images to the nearest
 pixel, then around the only good hypothesis with interpolation. An edge that runs along the epipolar line cannot be

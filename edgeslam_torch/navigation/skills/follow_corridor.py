@@ -34,7 +34,7 @@ _BACK_M = 2.3
 a grazing angle in passing."""
 _AT_END_M = 0.4
 _STANDS_S = 1.0
-"""Duration of a view at each heading: five depth maps, which show a mouth that was seen at a grazing angle."""
+"""Duration of a view at each heading: five depth maps, which show an entrance that was seen at a grazing angle."""
 _HOLDS_S = 2.0
 """Time for which a room, or an end without a view that is left, must hold: views arrive half a second late, and two
 free a cell."""
@@ -61,7 +61,7 @@ class FollowCorridor(Skill):
     _doors: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
     """``(2,)`` centre and unit normal of each exit."""
     _doubtful: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
-    """The same for candidates, which may also be corridors with a mouth narrowed by depth errors."""
+    """The same for candidates, which may also be corridors with an entrance narrowed by depth errors."""
 
     def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
         """Receive doors, which end a corridor."""
@@ -70,7 +70,7 @@ class FollowCorridor(Skill):
 
     def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
         """Goal cells ``(G, 2)``: wide space ahead, else a corridor that turns off, else narrow space straight ahead,
-        else a side corridor through a narrowed mouth, else viewpoints of the sides before the end."""
+        else a side corridor through a narrowed entrance, else viewpoints of the sides before the end."""
         here = state.p_w[:2]
         self._trail = self._trail or Trail.beginning(state)
         self._trail.fly(state)
@@ -104,7 +104,7 @@ class FollowCorridor(Skill):
         if not (room or ends or result is not None):
             return None
         if self._trail is None or len(self._trail.places_w) < 2:
-            return Result(False, "there is no corridor to follow here")
+            return Result(False, "there is not a corridor here")
         if room:
             return Result(True, "the corridor opens into a room")
         if ends:

@@ -1,6 +1,6 @@
 """Interface of a skill: a small state machine with one timeout and one stated result.
 
-A skill says where to go (goal cells), where to look, and when it has ended; the planner (`navigation/pilot.py`) flies.
+A skill chooses where to go (goal cells), where to look, and when to end; the planner (`navigation/pilot.py`) flies.
 """
 
 import math

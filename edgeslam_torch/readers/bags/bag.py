@@ -100,7 +100,7 @@ class Bag:
                     counts[name] = counts.get(name, 0) + (count if kind == first[0] else 0)
         filled = sorted(span for span in spans if span[1] < 2**62 * 1e-9)
         if not all(math.isfinite(begin) for begin, _, _ in filled):
-            raise SourceError(f"{path}: times of receipt that are no numbers")
+            raise SourceError(f"{path}: receive times that are not numbers")
         self._files = [file for _, _, file in filled] or self._files
         for (_, end, one), (begin, _, other) in pairwise(filled):
             if not end - _MAX_OVERLAP_S <= begin <= end + _MAX_GAP_S:
@@ -128,7 +128,7 @@ class Bag:
                 for connection, received_ns, data in reader.messages(wanted) if wanted else ():
                     received_s = 1e-9 * received_ns
                     if not math.isfinite(received_s):
-                        raise ValueError("a time of receipt that is no number")
+                        raise ValueError("a receive time that is not a number")
                     yield Raw(connection.topic, received_s, data)
 
     def first(self, name: str, count: int) -> list[tuple[Raw, Any]]:
@@ -179,7 +179,7 @@ class Bag:
     def _opened(self, file: Path) -> Iterator[Any]:
         for part in (file, *(file.iterdir() if file.is_dir() else ())):
             if part.exists() and not (part.is_file() or part.is_dir()):  # its readers would wait for a pipe
-                raise SourceError(f"{part}: is no plain file")
+                raise SourceError(f"{part}: is not a regular file")
         with needs_extra("bags", f"{self.path}: a ROS bag"):
             ros1, ros2 = readers()
         with self._no_damage(str(self.path)):

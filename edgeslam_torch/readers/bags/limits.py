@@ -185,7 +185,7 @@ def check_types(types: Any, topic: str) -> None:
 
     def plain(pattern: re.Pattern[str], name: object) -> None:
         if not (isinstance(name, str) and pattern.fullmatch(name)):
-            raise SourceError(f"{topic}: {str(name)[:40]!r} is no name in a message definition")
+            raise SourceError(f"{topic}: {str(name)[:40]!r} is not a name in a message definition")
 
     for kind, (constants, fields) in types.items():
         plain(_TYPE, kind)
@@ -195,7 +195,7 @@ def check_types(types: Any, topic: str) -> None:
             plain(_NAME, name)
             plain(_NAME, base)
             if not isinstance(value, bool | int | float | str) or value in (math.inf, -math.inf):
-                raise SourceError(f"{topic}: constant {name} is no finite number and no text")
+                raise SourceError(f"{topic}: constant {name} is neither a finite number nor text")
         for name, (node, detail) in fields:
             plain(_NAME, name)
             is_array = int(node) in (3, 4)

@@ -116,7 +116,7 @@ def _by_poses(folder: Path, folders: Sequence[Path]) -> dict[str, Any]:
         T_body_imu, T_body_cam = (matrix(record["T_BS"]) for record in records)
         return {"T_imu_cam": se3.inverse(T_body_imu) @ T_body_cam, "time_offset_s": 0.0}
     except (KeyError, TypeError, ValueError) as error:
-        raise SourceError(f"{files[0]}, {files[1]}: T_BS is no matrix of 4 x 4") from error
+        raise SourceError(f"{files[0]}, {files[1]}: T_BS is not a 4 x 4 matrix") from error
 
 
 def _coverage(model: ImuModel, readings: ImuReadings, first_s: float, last_s: float) -> list[str]:

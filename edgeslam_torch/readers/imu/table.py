@@ -1,4 +1,4 @@
-"""Readings of an IMU in a table with a header, or in EuRoC's order of columns; doubtful ones are named in one line."""
+"""Readings of an IMU in a table with a header, or in EuRoC's order of columns; suspicious ones are reported."""
 
 import re
 from collections.abc import Sequence
@@ -75,7 +75,7 @@ def _columns(table: Table) -> tuple[int, Sequence[int], Sequence[int], Sequence[
 def tidied(
     stamps_s: FloatArray, rate: FloatArray, force: FloatArray, has_gyroscope: bool
 ) -> tuple[ImuReadings, list[str]]:
-    """Readings in m/s^2 with increasing stamps, and what is doubtful about them.
+    """Readings in m/s^2 with increasing stamps, and remarks on suspicious ones.
 
     Args:
         stamps_s: ``(N,)`` as recorded [s].

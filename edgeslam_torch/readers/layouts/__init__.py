@@ -1,6 +1,6 @@
 """One module per data set: detects its folder and locates images, stamps, camera, ground truth and depth.
 
-A module in this folder is a layout. It has ``KIND``, ``recognises(folder)`` and ``read(folder)`` as `Layout` says; no
+A module in this folder is a layout. It has ``KIND``, ``recognises(folder)`` and ``read(folder)`` as in `Layout`; no
 other file refers to it. The first module, by name, that recognises a folder reads it.
 """
 

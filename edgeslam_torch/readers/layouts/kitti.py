@@ -34,7 +34,7 @@ def read(folder: Path) -> Sequence:
         if 0 <= number < len(stamps):
             entries.append(ImageEntry(len(entries), float(stamps[number]), path))
         else:
-            problems.append(Problem(str(path), "its name is no line of times.txt"))
+            problems.append(Problem(str(path), "its name is not a line of times.txt"))
     kept, more = in_order(entries, str(folder / name))
     truth = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
     return Sequence(
@@ -59,5 +59,5 @@ def _camera(path: Path, matrix: str, images: list[ImageEntry]) -> Camera | None:
     except (KeyError, ValueError, IndexError) as error:
         raise CalibrationError(f"{path}: no line '{matrix}:' with the 12 numbers of a projection matrix") from error
     if not (0 < fx < math.inf and 0 < fy < math.inf and math.isfinite(cx) and math.isfinite(cy)):
-        raise CalibrationError(f"{path}: {matrix} is no camera's projection matrix")
+        raise CalibrationError(f"{path}: {matrix} is not a camera's projection matrix")
     return Camera(*usual_size(images, str(path.parent)), fx, fy, cx, cy, source=f"KITTI's calibration {matrix}")

@@ -87,7 +87,7 @@ def simulated_camera(width: int = 640, height: int = 480) -> Camera:
 
 
 def flown(course: Course, seed: int, seconds: float | None = None) -> tuple[World, Flight, Rng]:
-    """World and flight of a course, and the generator that goes on with its telemetry.
+    """World and flight of a course, and the generator for its telemetry.
 
     Raises:
         ValueError: If the world has no free place to fly in.

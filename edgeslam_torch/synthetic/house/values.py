@@ -62,7 +62,7 @@ class Values:
             return eval(_compiled(value), self._functions, self.known)
         except NameError as error:
             known = ", ".join([*self.known, *(name for name in self._functions if name != "__builtins__")])
-            raise ConfigError(f"{value!r}: {error.name} is no value; known: {known}") from error
+            raise ConfigError(f"{value!r}: {error.name} is not a value; known: {known}") from error
         except (SyntaxError, TypeError, ValueError, ArithmeticError, RecursionError, MemoryError) as error:
             raise ConfigError(f"{value!r} cannot be computed ({error})") from error
 

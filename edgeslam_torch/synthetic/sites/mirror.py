@@ -1,4 +1,4 @@
-"""A wall that is a mirror: what a camera sees in it is the world once more, behind the wall."""
+"""A wall that is a mirror: a camera sees in it a second copy of the world, behind the wall."""
 
 import numpy as np
 

@@ -77,7 +77,7 @@ def corridor_ends(site: Site) -> list[FloatArray]:
         ValueError: If the site is no corridor.
     """
     if not is_corridor(site.name):
-        raise ValueError(f"{site.name} is no corridor to follow")
+        raise ValueError(f"{site.name} is not a corridor")
     goal = site.goal_w[:2]
     if site.exits:
         return [e.centre_w[:2] for e in site.exits]

@@ -55,7 +55,7 @@ def run_flight(case: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def fly_over_udp(case: Case) -> Flown:
-    """One flight to the site's goal; of the figures those that the emulator knows.
+    """One flight to the site's goal; with the figures that the emulator provides.
 
     Raises:
         EvaluationError: If the case is another task than that, or has a fault.

@@ -114,7 +114,7 @@ def test_story_has_the_runs_own_figures(run, summary, told):
 
 
 def test_warnings_of_the_run_stand_under_its_story(run):
-    said = ["telemetry's velocities are not used", "the video stood still </script>"]
+    said = ["telemetry's velocities are not used", "the video froze </script>"]
     file = write_report(with_summary(run, warnings=said))
     assert Page(file).data["warnings"] == said
     assert '<ul id="warnings"' in file.read_text(encoding="utf-8")

@@ -71,7 +71,7 @@ def test_a_split_recording_without_metadata_is_read_in_order(tmp_path, suffix):
 def test_a_pipe_in_a_bags_folder_is_refused(tmp_path, name):
     bags.write_ros2(tmp_path / "bag", _pictures(0, 3))
     os.mkfifo(tmp_path / "bag" / name)
-    with pytest.raises(SourceError, match="no plain file"):
+    with pytest.raises(SourceError, match="not a regular file"):
         open_source(tmp_path / "bag")
 
 

@@ -47,7 +47,7 @@ def test_evaluation_reads_the_same_clock(sequence):
 
 def test_image_without_a_stamp_is_left_out_by_name(sequence, write_images):
     write_images(sequence / "image_2", ["000004.png", "cover.png"])
-    assert [p.reason for p in open_source(sequence).problems] == ["its name is no line of times.txt"] * 2
+    assert [p.reason for p in open_source(sequence).problems] == ["its name is not a line of times.txt"] * 2
 
 
 def test_bad_files_are_named(sequence):

@@ -94,5 +94,5 @@ def test_killed_process_ends_the_other_clearly_and_training_goes_on(run_folder, 
     assert 50 <= step < 400
     done = run(*TORCHRUN, *MODULE, *words(run_folder, weights, out, 400))
     assert done.returncode == 0, done.stderr
-    assert f"goes on after step {step}" in done.stdout
+    assert f"resumes after step {step}" in done.stdout
     assert saved_step(out / "last.pt") == 400

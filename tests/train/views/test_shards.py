@@ -79,7 +79,7 @@ def test_files_of_others_in_metres_and_in_their_own_unit(tmp_path):
         ({"jpg": b"no image"}, "jpg: no image"),
         ({"depth_npy": b"no array"}, "cannot be read"),
         ({"json": b"{}"}, "cannot be read"),
-        ({"json": b'{"fx": NaN, "fy": 1, "cx": 0, "cy": 0}'}, "are no calibration"),
+        ({"json": b'{"fx": NaN, "fy": 1, "cx": 0, "cy": 0}'}, "are not a calibration"),
         ({"json": b"[]"}, "cannot be read"),
         ({"depth_png": cv2.imencode(".png", np.zeros((24, 30), np.uint16))[1].tobytes()}, "depth .* of an image"),
         ({"depth_png": cv2.imencode(".png", np.zeros((24, 32), np.uint8))[1].tobytes()}, "no 16-bit image"),
