@@ -19,7 +19,6 @@ from types import FrameType, ModuleType
 from typing import TYPE_CHECKING, Any, Protocol
 
 from edgeslam_torch.calibration.camera_choice import GUESS, GUESS_COST, GUESS_WARNING
-from edgeslam_torch.compiled import compile_all
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_text
@@ -263,7 +262,6 @@ class _Run:
         self.last_index: int | None = None
 
     def go(self) -> RunResult:
-        compile_all()  # before the clock: a first run then states the times of the next ones
         wall, cpu = time.perf_counter(), time.process_time()
         with self.interrupt:
             try:

@@ -129,8 +129,7 @@ class EdgeSlam:
         """Vertical in the output frame after `finish`: z, unless the axes are those of a loaded map. None if unknown; z
         is then the first camera's up axis."""
         self._T_b_c = camera_on_body(np.deg2rad(config.mount.tilt_deg), config.mount.forward_m)
-        if realtime:
-            compile_all()
+        compile_all()  # before the first frame: no camera waits, and a first run's times are those of later ones
         if executor is None and realtime:
             executor = ThreadPoolExecutor(1, thread_name_prefix="mapping")
         lm = lm_config(config.window)

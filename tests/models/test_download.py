@@ -130,7 +130,7 @@ def test_https_is_not_left_by_a_redirect():
         if allowed:
             assert handler.redirect_request(request, body, 302, "", {}, end) is not None
         else:
-            with pytest.raises(urllib.error.URLError, match="leads from https"):
+            with pytest.raises(urllib.error.URLError, match="redirects from https"):
                 handler.redirect_request(request, body, 302, "", {}, end)
 
 

@@ -226,7 +226,7 @@ def test_an_impossible_record_cannot_be_written():
 @pytest.mark.parametrize(
     ("header", "match"),
     [
-        (b"[]", "header is no table"),
+        (b"[]", "header is not a table"),
         (b'{"conv0.0.weight": 3}', "describes 'conv0.0.weight' wrongly"),
         (b'{"__metadata__": {"edgeslam": [1]}}', "metadata cannot be used"),
         (b'{"__metadata__": [1]}', "not a FastDepth checkpoint"),

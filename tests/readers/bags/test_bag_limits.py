@@ -260,5 +260,5 @@ def test_names_that_are_no_names_do_not_reach_the_compiler(name):
         {"a/msg/B": ([], [("x", (2, name))])},
         {"a/msg/B": ([], [("x", (4, ((2, name), 0)))])},
     ):
-        with pytest.raises(SourceError, match="no name"):
+        with pytest.raises(SourceError, match="not a name"):
             check_types(types, "/x")
