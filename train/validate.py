@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.eval.metrics.depth_error import report_depth
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.views.augment import View, fitted_view
@@ -84,10 +85,9 @@ def score(network: DepthModule, metadata: Metadata, views: Sequence[View]) -> De
     network.train(was_training)
     if not rows:
         raise SourceError(f"no depth between {MIN_DEPTH_M:g} and {MAX_DEPTH_M:g} m in any image to validate on")
-    table = np.array(rows)
-    means = [_mean(column) for column in table.T]
-    means[-1] = float(np.std(table[:, -1]))
-    return DepthScores(*means)
+    *columns, log_scale = np.array(rows).T
+    known = [column[~np.isnan(column)] for column in columns]  # images without edges have no error there
+    return DepthScores(*(float(c.mean()) if len(c) else float("nan") for c in known), float(np.std(log_scale)))
 
 
 def can_be_scored(view: View) -> bool:
@@ -99,26 +99,12 @@ def _counted(view: View) -> NDArray[np.bool_]:
     return (view.depth_m > MIN_DEPTH_M) & (view.depth_m < MAX_DEPTH_M)
 
 
-def _mean(column: FloatArray) -> float:
-    """Mean of the known values: images without edges have none."""
-    known = column[~np.isnan(column)]
-    return float(known.mean()) if len(known) else float("nan")
-
-
 def _scores_of(predicted: FloatArray, view: View) -> tuple[float, ...] | None:
-    mask = _counted(view)
-    if not mask.any():
+    counted = _counted(view)
+    if not counted.any():
         return None
-    p, t = predicted[mask], view.depth_m[mask]
-    ratio = float(np.median(t) / np.median(p))
-    edges = (cv2.Canny(cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY), 50, 150) > 0) & mask
-    at_edges = np.abs(predicted[edges] / view.depth_m[edges] - 1).mean() if edges.any() else np.nan
-    return (
-        float(np.abs(p / t - 1).mean()),
-        float(np.abs(p * ratio / t - 1).mean()),
-        float(np.sqrt(np.square(p - t).mean())),
-        float((np.maximum(p / t, t / p) < 1.25).mean()),
-        float((np.maximum(p * ratio / t, t / (p * ratio)) < 1.25).mean()),
-        float(at_edges),
-        float(np.log(ratio)),
-    )
+    found = report_depth(predicted, np.where(counted, view.depth_m, 0.0), view.image)
+    metric, scaled, edges = found["metric"], found["median_scaled"], found.get("edges_metric")
+    at_edges = np.nan if edges is None else edges.abs_rel
+    accurate = metric.delta1, scaled.delta1
+    return metric.abs_rel, scaled.abs_rel, metric.rmse_m, *accurate, at_edges, float(np.log(scaled.scale))

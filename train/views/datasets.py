@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.calibration.camera_choice import known_camera
-from edgeslam_torch.errors import CalibrationError, SourceError
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, nearest
+from edgeslam_torch.eval.inputs.dataset import open_depth
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.images import pixels_or_none
 from edgeslam_torch.readers.layouts import read_sequence
@@ -19,7 +21,6 @@ from edgeslam_torch.readers.sequence import DepthMaps
 from edgeslam_torch.terminal.progress import counted
 from edgeslam_torch.train.processes.distributed import rank
 from edgeslam_torch.train.views.augment import View, fitted_view
-from edgeslam_torch.types import FloatArray
 
 logger = logging.getLogger(__name__)
 
@@ -41,9 +42,7 @@ class DepthFolder:
     """Hash of the content, where reading all of it would take too long; None: of the views themselves."""
 
 
-def load_depth_folder(
-    folder: Path, width: int = 400, max_gap_s: float = 0.02, stride: int = 1, max_frames: int | None = None
-) -> DepthFolder:
+def load_depth_folder(folder: Path, width: int = 400, stride: int = 1, max_frames: int | None = None) -> DepthFolder:
     """Read a recording with depth maps, undistorted and scaled to ``width``.
 
     Each depth map is paired with the colour image nearest in time, and turned to its camera where it is not registered.
@@ -51,24 +50,21 @@ def load_depth_folder(
     Args:
         folder: The recording, in any layout.
         width: Images are reduced to this width [px] (never enlarged).
-        max_gap_s: Largest time between colour and depth [s].
         stride: Take every ``stride``-th depth map.
         max_frames: Use only depth maps among the first colour images.
 
     Raises:
-        SourceError: If there are no depth maps, or nothing can be learnt from.
-        CalibrationError: If the calibration is missing or malformed.
+        EvaluationError: If there are no depth maps, or the calibration is missing or malformed.
+        SourceError: If nothing can be learnt from.
     """
     folder = Path(os.path.abspath(folder))
-    sequence = read_sequence(folder)
-    if sequence is None or sequence.depth is None:
-        raise SourceError(f"{folder}: no recording with depth maps (rgb.txt, depth.txt and camera.yaml)")
-    camera = known_camera((folder, sequence.folder), sequence.camera)
-    if camera is None:
-        raise CalibrationError(f"{folder}: the camera is not known; put a camera.yaml into the folder")
-    maps = sequence.depth()
+    sequence, maps, camera = open_depth(folder)
     colours = sequence.images[:max_frames]
-    pairs = _pairs(np.array([entry.stamp_s for entry in colours]), maps.stamps_s, stride, max_gap_s)
+    stamps_s = np.array([entry.stamp_s for entry in colours])
+    depths = np.arange(0, len(maps.stamps_s), stride)
+    colour_of = nearest(stamps_s, maps.stamps_s[depths])
+    near = np.abs(stamps_s[colour_of] - maps.stamps_s[depths]) <= DEFAULT_MAX_DT_S
+    pairs = list(zip(colour_of[near].tolist(), depths[near].tolist(), strict=True))
     left_out = [_words(problem) for problem in (*sequence.problems, *maps.problems) if problem.frames]
     views = []
     for colour, depth in counted(pairs, f"reading {folder.name}", "image", shown=rank() == 0):
@@ -78,7 +74,7 @@ def load_depth_folder(
         else:
             views.append(reduced(view, width))
     if not views:
-        why = f" ({left_out[0]})" if left_out else f" (no image within {max_gap_s:g} s of a depth map)"
+        why = f" ({left_out[0]})" if left_out else f" (no image within {DEFAULT_MAX_DT_S:g} s of a depth map)"
         raise SourceError(f"{folder}: no image with depth could be read{why}")
     for remark in (_words(problem) for problem in maps.problems if not problem.frames):
         logger.warning("%s", remark)
@@ -99,18 +95,6 @@ def has_depth(folder: Path) -> bool:
     if sequence is None or sequence.depth is None:
         return False
     return known_camera((folder, sequence.folder), sequence.camera) is not None
-
-
-def _pairs(
-    colour_stamps_s: FloatArray, depth_stamps_s: FloatArray, stride: int, max_gap_s: float
-) -> list[tuple[int, int]]:
-    """Index of colour image and depth map, for each depth map with a colour image near it."""
-    if not len(colour_stamps_s):
-        return []
-    depths = range(0, len(depth_stamps_s), stride)
-    nearest = [int(np.argmin(np.abs(colour_stamps_s - depth_stamps_s[d]))) for d in depths]
-    found = zip(nearest, depths, strict=True)
-    return [(c, d) for c, d in found if abs(colour_stamps_s[c] - depth_stamps_s[d]) <= max_gap_s]
 
 
 def _read_view(colour_path: Path, maps: DepthMaps, index: int, camera: Camera) -> View | str:

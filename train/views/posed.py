@@ -1,6 +1,5 @@
 """Poses and sparse depth of a SLAM run, for self-supervised training."""
 
-import logging
 import os
 from collections.abc import Sequence
 from contextlib import closing
@@ -10,13 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.run_folder import is_supported, read_status
-from edgeslam_torch.files.plain import open_plain
-from edgeslam_torch.files.record_files import read_mapping
+from edgeslam_torch.eval.inputs.run_folder import is_supported, open_run
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.source import open_source
@@ -24,9 +20,6 @@ from edgeslam_torch.terminal.progress import Progress
 from edgeslam_torch.train.processes.distributed import rank
 from edgeslam_torch.train.views.augment import View, fitted_view
 from edgeslam_torch.types import FloatArray
-from edgeslam_torch.writers.ply import read_ply
-
-logger = logging.getLogger(__name__)
 
 MIN_PARALLAX, MAX_PARALLAX = 0.02, 0.2
 """Baseline over median depth of useful pairs: below, parallax is too small; above, too much is occluded."""
@@ -78,24 +71,15 @@ def is_run_folder(folder: Path) -> bool:
     return (folder / "summary.json").is_file() and (folder / "trajectory.txt").is_file()
 
 
-def load_run(
-    folder: Path,
-    source: str | None = None,
-    width: int = 320,
-    max_views: int = 600,
-    stamps: tuple[float, float] | None = None,
-    max_frames: int | None = None,
-) -> PosedSequence:
+def load_run(folder: Path, width: int = 320, max_views: int = 600, max_frames: int | None = None) -> PosedSequence:
     """Images of the recording that a run was made from, with the run's poses and map.
 
     Of a run in several unrelated pieces, the one with the most frames.
 
     Args:
         folder: Output of ``edgeslam run``.
-        source: The recording; by default the location in the run's summary.
         width: Images are reduced to this width.
         max_views: Views kept, evenly spread.
-        stamps: Use only frames between these stamps [s].
         max_frames: Use only the first frames of the recording.
 
     Raises:
@@ -104,24 +88,19 @@ def load_run(
     """
     folder = Path(os.path.abspath(folder))
     try:
-        summary = read_mapping(folder / "summary.json", "JSON", SourceError)
-        with open_plain(folder / "trajectory.txt") as file:
-            rows = np.loadtxt(file, ndmin=2)
-        recording = source if source is not None else str(folder.resolve() / summary["source"]["path"])
-        poses = {round(float(row[0]), 6): _pose(row) for row in rows}
-        trusted = _trusted_stamps(folder)
-    except (OSError, ValueError, KeyError, TypeError, IndexError, EvaluationError) as error:
-        why = " ".join(str(error).split())
-        raise SourceError(f"{folder}: not the output of 'edgeslam run' ({type(error).__name__}: {why})") from error
-    clouds = [read_ply(folder / n).p_w for n in ("anchors.ply", "edge_map.ply") if (folder / n).is_file()]
+        run = open_run(folder)
+        recording = str(folder.resolve() / run.summary["source"]["path"])
+    except (EvaluationError, KeyError, TypeError) as error:
+        raise SourceError(f"{folder}: not the output of 'edgeslam run' ({type(error).__name__}: {error})") from error
+    clouds = [cloud.p_w for name in ("anchors.ply", "edge_map.ply") if (cloud := run.cloud(name)) is not None]
     points = np.concatenate(clouds) if clouds else np.zeros((0, 3), np.float32)
-    kept = {t: T for t, T in poses.items() if trusted is None or t in trusted}
-    if stamps is not None:
-        kept = {t: T for t, T in kept.items() if stamps[0] <= t <= stamps[1]}
+    tracked = {round(float(row["stamp_s"]), 6) for row in run.pose_rows if is_supported(row)}
+    poses = zip(run.trajectory.stamps_s.tolist(), run.trajectory.T_w_c, strict=True)
+    kept = {round(t, 6): T for t, T in poses if not run.status or round(t, 6) in tracked}
     camera = folder / "camera.yaml"
     opened = open_source(recording, camera if camera.is_file() else None, max_frames=max_frames)
-    step = max(len(poses) // max_views, 1)
-    count = Progress(f"reading {folder.name}", opened.length or len(poses), "image", shown=rank() == 0)
+    step = max(len(run.trajectory) // max_views, 1)
+    count = Progress(f"reading {folder.name}", opened.length or len(run.trajectory), "image", shown=rank() == 0)
     views = []
     with closing(opened), closing(count):
         for frame in opened.frames():
@@ -136,8 +115,7 @@ def load_run(
             f"{folder}: only {len(views)} frames of {recording} have a pose and {MIN_POINTS} map points in view, "
             f"{MIN_VIEWS} are needed"
         )
-    metric = summary.get("scale", {}).get("units") == "metres"
-    return PosedSequence(folder.name, views, find_partners(views), metric)
+    return PosedSequence(folder.name, views, find_partners(views), run.units == "metres")
 
 
 def find_partners(views: Sequence[PosedView], reach: int = 40, most: int = 8) -> list[tuple[int, ...]]:
@@ -190,34 +168,6 @@ def _view(
         view = fitted_view(view, (round(camera.height * width / camera.width), width))
     uv, z = visible_points(p_w, view.K, T_w_c, (view.image.shape[0], view.image.shape[1]))
     return PosedView(name, view.image, view.K, T_w_c, uv, z)
-
-
-def _pose(row: FloatArray) -> FloatArray:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(row[4:8]).as_matrix()
-    T[:3, 3] = row[1:4]
-    return T
-
-
-def _trusted_stamps(folder: Path) -> set[float] | None:
-    """Stamps of the largest submap's tracked frames; None without a status table."""
-    rows = read_status(folder / "status.csv")
-    if not rows:
-        return None
-    pieces: dict[str, set[float]] = {}
-    for row in rows:
-        if is_supported(row):
-            pieces.setdefault(row.get("piece", ""), set()).add(round(float(row["stamp_s"]), 6))
-    largest = max(pieces.values(), key=len, default=set())
-    if len(pieces) > 1:
-        logger.warning(
-            "%s: %d pieces whose relation is not known; learning from the largest, %d of %d frames",
-            folder,
-            len(pieces),
-            len(largest),
-            sum(map(len, pieces.values())),
-        )
-    return largest
 
 
 def relative_motion(view_i: PosedView, view_j: PosedView) -> FloatArray:

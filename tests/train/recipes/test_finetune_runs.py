@@ -150,17 +150,6 @@ def test_run_without_a_useful_pair_is_named_and_gives_no_name(run_folder, tmp_pa
     assert "hovering: no two images" in caplog.text
 
 
-def test_largest_of_several_pieces_is_taken(run_folder, tmp_path, caplog):
-    folder = changed(run_folder, tmp_path)
-    rows = [line.split(",") for line in (folder / "status.csv").read_text().splitlines()[1:]]
-    lines = ["stamp_s,status,piece,supported"]
-    lines += [f"{stamp},tracked,{0 if k < 3 else 1},1" for k, (stamp, _) in enumerate(rows)]
-    (folder / "status.csv").write_text("\n".join(lines) + "\n")
-    sequence = load_run(folder)
-    assert len(sequence.views) == 9
-    assert "2 pieces whose relation is not known; learning from the largest, 9 of 12 frames" in caplog.text
-
-
 def test_first_frames_alone_are_used_when_asked(run_folder):
     assert len(load_run(run_folder, max_frames=10).views) == 9, "one of the ten is lost"
 
