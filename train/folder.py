@@ -1,33 +1,50 @@
 """The output folder of a fine-tuning, and whether training may resume in it.
 
-``finetune.json`` records the inputs of its tensors. Training resumes only with the same inputs.
+``finetune.json`` records what the tensors were made from, and the outcome. Training resumes only from the same inputs.
 """
 
 import dataclasses
+import hashlib
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from edgeslam_torch import __version__
+import numpy as np
+from torch import nn
+
 from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.train.inputs import NOT_COMPARED, Inputs, given_from_json
+from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.loop import BEST, CURVE, FINAL, LAST
-from edgeslam_torch.train.processes.distributed import by_first, rank, world
+from edgeslam_torch.train.processes.distributed import by_first, rank
 from edgeslam_torch.train.result import TrainingResult
 from edgeslam_torch.train.state import saved_step
+from edgeslam_torch.train.views.datasets import DepthFolder
+from edgeslam_torch.train.views.posed import PosedSequence
 from edgeslam_torch.writers.own_folder import FolderLock, check_free
 
 RECORD, WEIGHTS = "finetune.json", "weights.safetensors"
 TENSORBOARD, TEACHER = "tensorboard", "teacher"
 FILES = (LAST, BEST, FINAL, WEIGHTS, CURVE, TENSORBOARD, TEACHER)
 """Files of training beside the record."""
+HOOKS = "hooks"
+"""Setting with the names of the user's hooks."""
+NOT_COMPARED = (
+    *("steps", "patience", "validate_every", "checkpoint_every", "warmup_steps", HOOKS),
+    *("device", "amp", "channels_last", "workers", "accumulate"),
+)
+"""Settings of the length of training, and of where it is computed, may differ; those of hooks that change losses are
+compared."""
 WITH_RESUME = (*NOT_COMPARED, "lr", "encoder_lr")
 """Settings that may differ with ``--resume``: after a divergence, training continues at a smaller rate."""
+_CONTENT = "images of "
+
+Inputs = dict[str, Any]
+"""Everything that determines the result, by name: weights, data, the content of each data set, settings."""
 
 
 class Existing(StrEnum):
@@ -39,6 +56,64 @@ class Existing(StrEnum):
     """Resume, also at another learning rate; refuse if there is none."""
     OVERWRITE = "overwrite"
     """Replace it, once the data is read."""
+
+
+def inputs(
+    weights: str, data: Sequence[tuple[str, str]], validation: Sequence[str], settings: Mapping[str, Any]
+) -> Inputs:
+    """Inputs before anything is read.
+
+    Args:
+        weights: From `weights_name`.
+        data: Name and kind of each set: ``depth`` (labelled) or ``run`` (poses and map points).
+        validation: Names of the sets to validate on.
+        settings: By name, plain values.
+    """
+    named = ", ".join(f"{name} ({kind})" for name, kind in data)
+    return {"weights": weights, "data": named, "validation": ", ".join(validation) or "none", **settings}
+
+
+def contents(sets: Iterable[DepthFolder | PosedSequence]) -> Inputs:
+    """What was read, to be added to the inputs."""
+    found: Inputs = {}
+    for one in sets:
+        found[_CONTENT + one.name] = found.get(_CONTENT + one.name, "") + content(one)
+    return found
+
+
+def content(data: DepthFolder | PosedSequence) -> str:
+    """Number of images, and a hash of all that is learnt from: images, calibration, depth or poses and map points."""
+    if isinstance(data, PosedSequence):
+        arrays = [array for v in data.views for array in (v.image, v.K, v.T_w_c, v.uv, v.z)]
+        return f"{len(data.views)}, {_hash(arrays, str(data.metric))}"
+    digest = data.sha256 or _hash(array for v in data.views for array in (v.image, v.depth_m, v.K))
+    return f"{len(data.views)}, {digest}"
+
+
+def weights_name(network: nn.Module, metadata: Metadata) -> str:
+    """Variant and the first digits of a hash over all tensors and the record."""
+    tensors = [value.detach().cpu().numpy() for _, value in sorted(network.state_dict().items())]
+    record = json.dumps(dataclasses.asdict(metadata), sort_keys=True)
+    return f"{metadata.variant} {_hash(tensors, record)[:12]}"
+
+
+def _hash(arrays: Iterable[np.ndarray], text: str = "") -> str:
+    digest = hashlib.sha256(text.encode())
+    for array in arrays:
+        digest.update(f"{array.dtype} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def differences(then: Inputs, now: Inputs, ignored: Sequence[str] = NOT_COMPARED) -> list[str]:
+    """What differs, in words, but for some settings; data that was not read yet is not compared."""
+    unread = {name for name in then.keys() ^ now.keys() if name.startswith(_CONTENT)}
+    names = sorted((then.keys() | now.keys()) - {*ignored, *unread})
+    return [f"{k}: {_short(then.get(k))} then, {_short(now.get(k))} now" for k in names if then.get(k) != now.get(k)]
+
+
+def _short(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)[:120]
 
 
 class OutFolder:
@@ -73,7 +148,7 @@ class OutFolder:
             strange = next((name for name in FILES if (self.path / name).exists()), None)
             if strange is not None:
                 raise OutputError(
-                    f"{self.path}: holds {strange}, but no {RECORD} that states its origin; give another --out"
+                    f"{self.path}: holds {strange}, but no {RECORD} that says where it is from; give another --out"
                 )
             check_free(self.path, ())
             if self.existing is Existing.RESUME:
@@ -81,23 +156,18 @@ class OutFolder:
             return
         if self.existing is Existing.OVERWRITE or not (step := self.step):
             return
-        steps = given.settings["steps"]
-        if step > steps:
-            raise ConfigError(f"{self.path}: has {step} steps already, so it cannot end after {steps}")
-        ignored = WITH_RESUME if self.existing is Existing.RESUME else NOT_COMPARED
-        different = given_from_json(record["given"]).differences(given, ignored)
-        if different:
-            only_rate = not given_from_json(record["given"]).differences(given, WITH_RESUME)
-            way_out = "--resume to continue with it" if only_rate else "--overwrite to replace it"
+        if step > given["steps"]:
+            raise ConfigError(f"{self.path}: has {step} steps behind it, so it cannot end after {given['steps']}")
+        resumed = self.existing is Existing.RESUME
+        if different := differences(record["given"], given, WITH_RESUME if resumed else NOT_COMPARED):
+            only_rate = not differences(record["given"], given, WITH_RESUME)
+            way_out = "--resume to go on like this" if only_rate else "--overwrite to replace it"
             raise ConfigError(
                 f"{self.path}: holds another fine-tuning ({'; '.join(different)}); give another --out, or {way_out}"
             )
 
-    def begin(self, given: Inputs) -> int:
+    def begin(self, given: Inputs) -> None:
         """Record the inputs, and remove files of other trainings.
-
-        Returns:
-            The step to resume from, 0 for a new training.
 
         Raises:
             ConfigError, OutputError: As for `check`.
@@ -105,28 +175,18 @@ class OutFolder:
         """
         self.check(given)
         record = self._record()
-        kept = record is not None and self.existing is not Existing.OVERWRITE
-        if kept and record is not None and not self.step:  # interrupted early: the teacher's depth may exist
-            kept = not given_from_json(record["given"]).differences(given, WITH_RESUME)
-        if not kept:
+        resumes = record is not None and self.existing is not Existing.OVERWRITE
+        # One that was interrupted before the first step may have left its teacher's depth.
+        if not resumes or (not self.step and record and differences(record["given"], given, WITH_RESUME)):
             self._clear()
-        step = self.step
-        session = {"from_step": step, "processes": world(), "version": __version__}
-        session |= {name: given.settings[name] for name in WITH_RESUME if name in given.settings}
-        sessions = [*record["sessions"], session] if kept and record is not None else [session]
-        self._write({"given": dataclasses.asdict(given), "sessions": sessions, "outcome": None})
-        return step
+        self._write({"given": given, "outcome": None})
 
     def finished(self, given: Inputs) -> TrainingResult | None:
         """Result of an identical earlier training, if any."""
-        record = self._record()
-        if record is None or record["outcome"] is None or self.existing is Existing.OVERWRITE:
+        record, weights = self._record(), self.path / WEIGHTS
+        if record is None or record["outcome"] is None or self.existing is Existing.OVERWRITE or not weights.is_file():
             return None
-        if not (self.path / WEIGHTS).is_file():
-            return None
-        if given_from_json(record["given"]).differences(given, ()):
-            return None
-        return TrainingResult.from_json(record["outcome"], self.path / WEIGHTS)
+        return None if differences(record["given"], given, ()) else TrainingResult.from_json(record["outcome"], weights)
 
     def finish(self, outcome: TrainingResult) -> None:
         """Record the outcome.
@@ -154,10 +214,9 @@ class OutFolder:
             return None
         try:
             record = json.loads(path.read_text(encoding="utf-8"))
-            given_from_json(record["given"])
             if record["outcome"] is not None:
                 TrainingResult.from_json(record["outcome"], self.path / WEIGHTS)
-            return {"given": record["given"], "sessions": list(record["sessions"]), "outcome": record["outcome"]}
+            return {"given": dict(record["given"]), "outcome": record["outcome"]}
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise OutputError(f"{path}: unreadable ({type(error).__name__}); give another --out") from error
 

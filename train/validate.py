@@ -1,5 +1,7 @@
 """Depth metrics on held-out views, as the recipe prints them."""
 
+import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -34,6 +36,11 @@ class DepthScores:
     """Metric, Canny edge pixels alone."""
     log_scale_std: float
     """Standard deviation over images of the log median ratio: variation of scale."""
+
+    def metrics(self) -> dict[str, float]:
+        """By name, without figures that no image has; ``score`` is what decides."""
+        found = {k: v for k, v in dataclasses.asdict(self).items() if math.isfinite(v)}
+        return {"score": self.abs_rel_scaled, **found}
 
 
 def image_tensor(image: NDArray[np.uint8], metadata: Metadata) -> torch.Tensor:

@@ -29,9 +29,8 @@ from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.layout import Variant
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
-from edgeslam_torch.train.folder import OutFolder
+from edgeslam_torch.train.folder import OutFolder, content
 from edgeslam_torch.train.hooks import Hooks
-from edgeslam_torch.train.inputs import posed_set
 from edgeslam_torch.train.processes.distributed import rank, world
 from edgeslam_torch.train.recipes.finetune import Data, finetune
 from edgeslam_torch.train.result import TrainingResult
@@ -72,8 +71,8 @@ def distil(
         if not (teacher.is_metric or run.metric):
             raise ConfigError(f"{run.name}: neither the teacher nor the run gives metres; add telemetry to it")
         log_scale = log_metres(partial(usable_depth, teacher), run) if teacher.is_metric else 0.0
-        content = posed_set(run).sha256, sha256, log_scale
-        data.labelled.append(label(teacher, run, log_scale, kept_depth(root, run.name, *content)))
+        folder = kept_depth(root, run.name, content(run), sha256, log_scale)
+        data.labelled.append(label(teacher, run, log_scale, folder))
     for line in data.describe() if rank() == 0 else ():
         say(line)
     return finetune(student, metadata, data, config, out, reading=reading, hooks=hooks, calibrate=True)

@@ -21,9 +21,18 @@ from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
 from edgeslam_torch.train.callbacks import ProgressBar, curves
-from edgeslam_torch.train.folder import TEACHER, TENSORBOARD, WEIGHTS, OutFolder
+from edgeslam_torch.train.folder import (
+    HOOKS,
+    TEACHER,
+    TENSORBOARD,
+    WEIGHTS,
+    OutFolder,
+    content,
+    contents,
+    inputs,
+    weights_name,
+)
 from edgeslam_torch.train.hooks import Hooks, changes_losses
-from edgeslam_torch.train.inputs import HOOKS, Inputs, labelled_set, posed_set, weights_name
 from edgeslam_torch.train.loop import BEST, FINAL, train
 from edgeslam_torch.train.processes.distributed import by_first, rank
 from edgeslam_torch.train.result import TrainingResult
@@ -121,12 +130,13 @@ def finetune(
         OSError: If the file cannot be written.
     """
     data = data.usable()
-    given = Inputs(
+    sets = [(f.name, "depth") for f in data.labelled] + [(s.name, "run") for s in data.posed]
+    given = inputs(
         weights_name(network, metadata),
-        (*map(labelled_set, data.labelled), *map(posed_set, data.posed)),
-        tuple(map(labelled_set, data.validation)),
+        sets,
+        [f.name for f in data.validation],
         settings_of(config, from_runs, reading, hooks),
-    )
+    ) | contents([*data.labelled, *data.posed, *data.validation])
     if (done := by_first(lambda: out.finished(given))) is not None:
         return dataclasses.replace(done, nothing_to_do=True)
     by_first(lambda: out.begin(given))
@@ -138,18 +148,15 @@ def finetune(
     if rank() == 0:
         watching = [ProgressBar(), *hooks, *curves(subfolder(out.path, TENSORBOARD), tuned, _pictures(data, held_out))]
 
-    def validate(averaged: DepthModule) -> dict[str, float]:
-        return _metrics(score(averaged, metadata, held_out))
-
     state = train(
         network,
         tuned,
         signals,
         config,
         out.path,
-        validate if held_out else None,
+        (lambda averaged: score(averaged, metadata, held_out).metrics()) if held_out else None,
         watching,
-        None if before is None else _metrics(before),
+        None if before is None else before.metrics(),
     )
     return by_first(lambda: _conclude(state, start, metadata, tuned, before, held_out, out, calibrate))
 
@@ -180,8 +187,8 @@ def _prepared(
         if from_runs is not FromRuns.PAIRS:
             sources = []
             for sequence, scale in zip(data.posed, scales, strict=True):
-                content = posed_set(sequence).sha256, weights_name(start, metadata), scale
-                taught = teach(own, sequence, scale, kept_depth(kept_in, sequence.name, *content))
+                made_from = content(sequence), weights_name(start, metadata), scale
+                taught = teach(own, sequence, scale, kept_depth(kept_in, sequence.name, *made_from))
                 if not (data.validation or labelled):
                     held_out += [_measured_only(t) for t in taught[::HELD_OUT]]
                     taught = [t for i, t in enumerate(taught) if i % HELD_OUT]
@@ -249,7 +256,7 @@ def _conclude(
         last, best = (restored(start, out.path / name) for name in (FINAL, BEST))
         kept = score(best, metadata, held_out)
         outcome = TrainingResult(path, state.step, state.best_step, before, score(last, metadata, held_out), kept)
-        record = dataclasses.replace(tuned, metrics={k: round(v, 4) for k, v in _metrics(kept).items() if k != "score"})
+        record = dataclasses.replace(tuned, metrics={k: round(v, 4) for k, v in kept.metrics().items() if k != "score"})
         if calibrate:
             record = calibrate_sigma(best, record, held_out)
         save_checkpoint(best, outcome.noted_in(record), path, half=True)
@@ -257,12 +264,6 @@ def _conclude(
     for warning in outcome.warnings():
         logger.warning("%s", warning)
     return outcome
-
-
-def _metrics(scores: DepthScores) -> dict[str, float]:
-    """By name; ``score`` is what decides. Figures without any image are omitted."""
-    found = {k: v for k, v in dataclasses.asdict(scores).items() if math.isfinite(v)}
-    return {"score": scores.abs_rel_scaled, **found}
 
 
 def _pictures(data: Data, held_out: Sequence[View]) -> list[View]:

@@ -1,11 +1,10 @@
 """Rendered rooms, corridors, halls and sites of flights as training views, drawn once and kept in files.
 
-``default`` learns from level views of rooms (`render_rooms`); ``near`` from views of `random_place`, also oblique and
-near ones. ``python -m edgeslam_torch.train.recipes.rendered_views DIR --places 3000 --processes 12`` draws the latter.
+``default`` learns from level views of rooms (`room_views`); ``near`` from views of a `random_place`, also oblique and
+near ones (`place_views`).
 """
 
-import argparse
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -32,6 +31,8 @@ KEEP_FLAT = 0.3
 LEVEL_FOCAL_PX = (140.0, 380.0)
 """Of the 320 pixel wide images: 98 to 46 degrees across."""
 OBLIQUE_FOCAL_PX = (130.0, 300.0)
+ROOM_VIEWS = 6
+"""Of each room."""
 LEVEL_VIEWS, OBLIQUE_VIEWS, NEAR_VIEWS = 8, 5, 5
 """Of each place."""
 NEAREST_M = 0.18
@@ -44,18 +45,54 @@ TRIES = 8
 PLACES_A_FILE = 10
 
 
-def render_rooms(path: Path, rooms: int, views_per_room: int = 6, seed: int = 7) -> None:
-    """Draw level views of random rooms into a file; room r depends on (seed, r) alone."""
+Drawn = Iterator[tuple[Camera, Rendered]]
+"""Views with their cameras."""
 
-    def views() -> Iterator[tuple[Camera, Rendered]]:
-        for r in counted(range(rooms), "rendering rooms", "room"):
-            rng = np.random.default_rng((seed, r))
-            world = random_room(rng)
-            for _ in range(views_per_room):
-                camera = _camera(_log(rng, *ROOM_FOCAL_PX))
-                yield camera, random_view(rng, camera, world)
 
-    _store(path, views())
+def room_views(rng: Rng) -> Drawn:
+    """Level views of a random room."""
+    world = random_room(rng)
+    for _ in range(ROOM_VIEWS):
+        camera = _camera(_log(rng, *ROOM_FOCAL_PX))
+        yield camera, random_view(rng, camera, world)
+
+
+def place_views(rng: Rng) -> Drawn:
+    """Level, oblique and near views of a random place."""
+    world = random_place(rng)
+    for kind in ["level"] * LEVEL_VIEWS + ["oblique"] * OBLIQUE_VIEWS + ["near"] * NEAR_VIEWS:
+        camera = _camera(_log(rng, *(OBLIQUE_FOCAL_PX if kind == "oblique" else LEVEL_FOCAL_PX)))
+        if kind == "level":
+            rendered: Rendered | None = random_view(rng, camera, world)
+        else:
+            rendered = close_view(rng, camera, world, oblique_pose if kind == "oblique" else near_pose)
+        if rendered is not None:
+            yield camera, rendered
+
+
+def render_files(folder: Path, views: Callable[[Rng], Drawn], places: int, seed: int, processes: int = 1) -> list[Path]:
+    """Draw views of ``places`` places into ``folder``, `PLACES_A_FILE` a file, without most of the flat ones; place p
+    depends on (seed, p) alone. Files that are there stay. Returns all of them, in the order of the places."""
+    folder.mkdir(parents=True, exist_ok=True)
+    firsts = range(0, places, PLACES_A_FILE)
+    files = {folder / f"places_{first:05d}.npz": range(first, min(first + PLACES_A_FILE, places)) for first in firsts}
+    work = [(path, views, numbers, seed) for path, numbers in files.items() if not path.is_file()]
+    with get_context("spawn").Pool(processes) as pool:
+        for _ in counted(pool.imap(_render_file, work), "rendering places", "file", len(work)):
+            pass
+    return list(files)
+
+
+def _render_file(work: tuple[Path, Callable[[Rng], Drawn], range, int]) -> None:
+    path, views, numbers, seed = work
+    found = []
+    for p in numbers:
+        rng = np.random.default_rng((seed, p))
+        for camera, view in views(rng):
+            if is_worth_learning(view.depth_m, rng.random()):
+                found.append((view.image, view.depth_m.astype(np.float16), camera.K))
+    arrays = {name: np.array([row[k] for row in found]) for k, name in enumerate(("image", "depth", "K"))}
+    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
 
 def stored_views(path: Path) -> list[View]:
@@ -72,12 +109,6 @@ def is_worth_learning(depth_m: FloatArray, lottery: float) -> bool:
         return False
     low, high = np.percentile(known, (10, 90))
     return bool(high > MIN_SPREAD * low or lottery < KEEP_FLAT)
-
-
-def _store(path: Path, views: Iterable[tuple[Camera, Rendered]]) -> None:
-    found = [(view.image, view.depth_m.astype(np.float16), camera.K) for camera, view in views]
-    arrays = {name: np.array([row[k] for row in found]) for k, name in enumerate(("image", "depth", "K"))}
-    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
 
 def random_place(rng: Rng) -> World:
@@ -157,43 +188,6 @@ def close_view(
     return None
 
 
-def render_files(folder: Path, places: int, seed: int = 21, processes: int = 1) -> None:
-    """Draw views of ``places`` places into ``folder``, `PLACES_A_FILE` a file ``places_NNNNN.npz``, without most of the
-    flat ones; place p depends on (seed, p) alone. Files that are there stay."""
-    folder.mkdir(parents=True, exist_ok=True)
-    firsts = range(0, places, PLACES_A_FILE)
-    work = [(folder / f"places_{first:05d}.npz", first, min(first + PLACES_A_FILE, places), seed) for first in firsts]
-    work = [item for item in work if not item[0].is_file()]
-    with get_context("spawn").Pool(processes) as pool:
-        for _ in counted(pool.imap(_render_file, work), "rendering places", "file", len(work)):
-            pass
-
-
-def _render_file(work: tuple[Path, int, int, int]) -> None:
-    path, first, end, seed = work
-
-    def views() -> Iterator[tuple[Camera, Rendered]]:
-        for p in range(first, end):
-            rng = np.random.default_rng((seed, p))
-            for camera, view in _views(rng, random_place(rng)):
-                if is_worth_learning(view.depth_m, rng.random()):
-                    yield camera, view
-
-    _store(path, views())
-
-
-def _views(rng: Rng, world: World) -> Iterator[tuple[Camera, Rendered]]:
-    """All views of a place that there are."""
-    for kind in ["level"] * LEVEL_VIEWS + ["oblique"] * OBLIQUE_VIEWS + ["near"] * NEAR_VIEWS:
-        camera = _camera(_log(rng, *(OBLIQUE_FOCAL_PX if kind == "oblique" else LEVEL_FOCAL_PX)))
-        if kind == "level":
-            rendered: Rendered | None = random_view(rng, camera, world)
-        else:
-            rendered = close_view(rng, camera, world, oblique_pose if kind == "oblique" else near_pose)
-        if rendered is not None:
-            yield camera, rendered
-
-
 def _camera(focal_px: float) -> Camera:
     return Camera(WIDTH, HEIGHT, focal_px, focal_px, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
@@ -201,18 +195,3 @@ def _camera(focal_px: float) -> Camera:
 def _log(rng: Rng, low: float, high: float) -> float:
     """Uniform in the logarithm."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--places", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=21)
-    parser.add_argument("--processes", type=int, default=1)
-    args = parser.parse_args()
-    render_files(args.folder, args.places, args.seed, args.processes)
-
-
-if __name__ == "__main__":
-    main()

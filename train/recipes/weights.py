@@ -7,14 +7,12 @@ and gentler augmentation, the rate falling to nothing; 3. uncertainty calibrated
 2. the mean of the weights before and after, which often does better on places of neither than both ends do (Wortsman
 et al., CVPR 2022).
 
-The evaluation sequences are not used, except to plot the curve (``--watch``); the last weights are kept, not the best
-on the curve. ``--leave-out`` keeps a recording of ``near`` for judging.
+No recording that figures are quoted of is used; the last weights are kept, not the best on the curve.
 """
 
 import argparse
-import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -30,7 +28,7 @@ from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
 from edgeslam_torch.train.callbacks import ProgressBar
 from edgeslam_torch.train.loop import FINAL, train
-from edgeslam_torch.train.recipes.rendered_views import is_worth_learning, render_files, render_rooms, stored_views
+from edgeslam_torch.train.recipes.rendered_views import Drawn, place_views, render_files, room_views, stored_views
 from edgeslam_torch.train.signals import Source, Supervised, SupervisedWeights
 from edgeslam_torch.train.state import TrainConfig
 from edgeslam_torch.train.validate import score
@@ -42,10 +40,10 @@ logger = logging.getLogger(__name__)
 IMAGENET = "mobilenet_v1_imagenet/mobilenet_v1_1.0_224_quant_embedding_extractor.tflite"
 INPUT_SIZE = (160, 224)
 """Height and width [px]; a third faster than 192x256 and as accurate (model card)."""
-RENDERED, PLACES = "rendered", "places"
-ROOMS, VIEWS_PER_ROOM, NUMBER_OF_PLACES = 350, 6, 300
+RENDERED = "rendered"
+NUMBER_OF_ROOMS, NUMBER_OF_PLACES = 350, 300
 HELD_OUT_VIEWS = 150
-"""Last rendered views, whole rooms, kept out of training for the calibration."""
+"""First rendered views, of whole places, kept out of training for the curve and the calibration."""
 MEAN_SHARE = 0.5
 """Of the weights after, in the mean."""
 LICENCE = (
@@ -60,7 +58,7 @@ class Phase:
     """One training."""
 
     shares: dict[str, float]
-    """Parts of the batch by recording, or `RENDERED` or `PLACES`, relative to each other."""
+    """Parts of the batch by recording, or `RENDERED`, relative to each other."""
     config: TrainConfig
     augment: AugmentConfig
     metric: float
@@ -68,18 +66,34 @@ class Phase:
     weights: SupervisedWeights = field(default_factory=SupervisedWeights)
 
     def run(
-        self, network: DepthModule, metadata: Metadata, pools: dict[str, Sequence[View]], out: Path, validate: "Scores"
+        self,
+        network: DepthModule,
+        metadata: Metadata,
+        pools: dict[str, Sequence[View]],
+        out: Path,
+        held_out: Sequence[View],
     ) -> DepthModule:
-        """Train, unless that is done; resumes where it was killed. Returns the averaged weights."""
+        """Train, unless that is done; resumes where it was killed. Returns the averaged weights.
+
+        ``held_out`` draws the curve.
+        """
         if (out / FINAL).is_file():
             logger.info("%s is there already", out / FINAL)
         else:
             sources = [
-                Source(name, pools[name], share, self.metric if name in (RENDERED, PLACES) else 1.0)
+                Source(name, pools[name], share, self.metric if name == RENDERED else 1.0)
                 for name, share in self.shares.items()
             ]
             signal = Supervised(sources, metadata, self.augment, self.weights)
-            train(network, metadata, [signal], self.config, out, validate, [ProgressBar()])
+            train(
+                network,
+                metadata,
+                [signal],
+                self.config,
+                out,
+                lambda averaged: score(averaged, metadata, held_out).metrics(),
+                [ProgressBar()],
+            )
         return load_checkpoint(out / FINAL)[0]
 
 
@@ -105,7 +119,7 @@ SETTLE = Phase(
 )
 # Corridors have true widths, and real ones were estimated half as long as they are.
 NEAR = Phase(
-    {"tum_fr1_rpy_depth": 0.25, "icl_livingroom1": 0.1, "icsl_corridor": 0.12, "hololens_a": 0.15, PLACES: 0.5},
+    {"tum_fr1_rpy_depth": 0.25, "icl_livingroom1": 0.1, "icsl_corridor": 0.12, "hololens_a": 0.15, RENDERED: 0.5},
     TrainConfig(
         steps=3600,
         lr=1e-3,
@@ -124,89 +138,65 @@ NEAR = Phase(
 )
 
 
-class Scores:
-    """Of a network on named sets; the first one decides."""
-
-    def __init__(self, metadata: Metadata, sets: dict[str, Sequence[View]]) -> None:
-        self.metadata, self.sets = metadata, sets
-
-    def __call__(self, network: DepthModule) -> dict[str, float]:
-        """As `train` takes it."""
-        metrics: dict[str, float] = {}
-        for name, views in self.sets.items():
-            for key, value in dataclasses.asdict(score(network, self.metadata, views)).items():
-                metrics[f"{name}/{key}"] = round(value, 4)
-        metrics["score"] = metrics[f"{next(iter(self.sets))}/abs_rel_scaled"]
-        logger.info("%s", " ".join(f"{k} {v:.4f}" for k, v in metrics.items()))
-        return metrics
-
-
-def make_default(data: Path, out: Path, phases: Sequence[Phase] = (BROAD, SETTLE), watch: Sequence[str] = ()) -> Path:
-    """Run all phases; each resumes where it was killed.
+def make_default(data: Path, out: Path) -> Path:
+    """Run both phases; each resumes where it was killed. Returns the finished weights file.
 
     Args:
         data: Folder with the recordings and the ImageNet encoder.
         out: Folder for everything.
-        phases: With the same sources.
-        watch: Recordings under ``data`` drawn into the curve, never trained on.
-
-    Returns:
-        The finished weights file.
     """
-    out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(0)
     height, width = INPUT_SIZE
-    names = ("ImageNet (encoder)", *phases[0].shares)
+    names = ("ImageNet (encoder)", *BROAD.shares)
     metadata = Metadata(input_height=height, input_width=width, data=names, licence=LICENCE)
-    rooms = out / "rendered.npz"
-    if not rooms.is_file():
-        render_rooms(rooms, ROOMS, VIEWS_PER_ROOM)
-    rng = np.random.default_rng(0)
-    rendered = [view for view in stored_views(rooms) if is_worth_learning(view.depth_m, rng.random())]
-    held_out = rendered[-HELD_OUT_VIEWS:]
-    pools: dict[str, Sequence[View]] = {
-        name: rendered[:-HELD_OUT_VIEWS] if name == RENDERED else load_depth_folder(data / name).views
-        for name in phases[0].shares
-    }
-    watched = {name: load_depth_folder(data / name, 640, stride=6).views for name in watch}
-    validate = Scores(metadata, {RENDERED: held_out, **watched})
+    rooms, held_out = _rendered(out / RENDERED, room_views, NUMBER_OF_ROOMS, seed=7)
+    pools = _pools(data, BROAD, rooms, width=400)
     new = build_network(metadata)
     load_imagenet_encoder(new, data / IMAGENET)
     network: DepthModule = new
-    for phase, name in zip(phases, ("broad", "settle"), strict=True):
-        network = phase.run(network, metadata, pools, out / name, validate)
+    for phase, name in ((BROAD, "broad"), (SETTLE, "settle")):
+        network = phase.run(network, metadata, pools, out / name, held_out)
     save_checkpoint(network, calibrate_sigma(network, metadata, held_out), out / "default.safetensors", half=True)
     return out / "default.safetensors"
 
 
-def make_near(data: Path, out: Path, start: Path | None, phase: Phase = NEAR, watch: Sequence[str] = ()) -> Path:
+def make_near(data: Path, out: Path, start: Path | None, device: str = "auto") -> Path:
     """Train; resumes where it was killed. Returns the file with the mean of the weights before and after.
 
     Args:
         data: Folder with the recordings.
         out: Folder for everything.
         start: Weights to begin with; the shipped ones by default.
-        phase: What is taught, and how.
-        watch: Recordings under ``data`` drawn into the curve, never trained on.
+        device: Where it is computed.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    render_files(out / PLACES, NUMBER_OF_PLACES, seed=16 + phase.config.seed)
-    first, *others = sorted((out / PLACES).glob("*.npz"))
+    places, held_out = _rendered(out / RENDERED, place_views, NUMBER_OF_PLACES, seed=21)
     network, metadata = load_checkpoint(start)
-    data_names = tuple(dict.fromkeys((*metadata.data, *phase.shares)))
+    data_names = tuple(dict.fromkeys((*metadata.data, *NEAR.shares)))
     metadata = replace(metadata, data=data_names, metrics={}, sigma_scale=1.0, sigma_floor=0.0)
-    pools: dict[str, Sequence[View]] = {
-        name: [view for file in others for view in stored_views(file)]
-        if name == PLACES
-        else load_depth_folder(data / name, width=320).views
-        for name in phase.shares
-    }
-    watched = {name: load_depth_folder(data / name, 480, stride=12).views for name in watch}
-    after = phase.run(network, metadata, pools, out, Scores(metadata, {PLACES: stored_views(first), **watched}))
+    phase = replace(NEAR, config=replace(NEAR.config, device=device))
+    after = phase.run(network, metadata, _pools(data, NEAR, places, width=320), out, held_out)
     before = load_checkpoint(start)[0]
     before.load_state_dict(mean_of(before, after, MEAN_SHARE))
     save_checkpoint(before, metadata, out / "mean.safetensors", half=True)
     return out / "mean.safetensors"
+
+
+def _rendered(
+    folder: Path, views: Callable[[np.random.Generator], Drawn], places: int, seed: int
+) -> tuple[list[View], list[View]]:
+    """Rendered views to learn from, and `HELD_OUT_VIEWS` or some more of the first places, held out."""
+    taught: list[View] = []
+    held_out: list[View] = []
+    for file in render_files(folder, views, places, seed):
+        (taught if len(held_out) >= HELD_OUT_VIEWS else held_out).extend(stored_views(file))
+    return taught, held_out
+
+
+def _pools(data: Path, phase: Phase, rendered: Sequence[View], width: int) -> dict[str, Sequence[View]]:
+    """What a phase draws from, by name."""
+    return {
+        name: rendered if name == RENDERED else load_depth_folder(data / name, width).views for name in phase.shares
+    }
 
 
 def mean_of(first: DepthModule, second: DepthModule, share: float) -> dict[str, torch.Tensor]:
@@ -227,30 +217,15 @@ def main() -> None:
     parser.add_argument("job", choices=("default", "near"))
     parser.add_argument("--data", type=Path, required=True, help="folder with the recordings")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--watch", nargs="*", default=[], help="recordings drawn into the curve, never trained on")
-    parser.add_argument("--steps", type=int, nargs="+", help="other lengths of the phases")
-    parser.add_argument("--leave-out", nargs="*", default=[], help="sources not to be taught")
     parser.add_argument("--weights", type=Path, help="near: to begin with (default: the shipped ones)")
-    parser.add_argument("--seed", type=int, default=NEAR.config.seed, help="near: of places and steps")
     parser.add_argument("--device", default="auto", choices=DEVICES, help="near: where it is computed")
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     torch.set_num_threads(1)
-    phases = [BROAD, SETTLE] if args.job == "default" else [NEAR]
-    steps = args.steps or [phase.config.steps for phase in phases]
-    own = {} if args.job == "default" else {"seed": args.seed, "device": args.device}
-    phases = [
-        replace(
-            phase,
-            shares={name: share for name, share in phase.shares.items() if name not in args.leave_out},
-            config=replace(phase.config, steps=count, **own),
-        )
-        for phase, count in zip(phases, steps, strict=True)
-    ]
     if args.job == "default":
-        logger.info("weights: %s", make_default(args.data, args.out, phases, args.watch))
+        logger.info("weights: %s", make_default(args.data, args.out))
     else:
-        logger.info("weights: %s", make_near(args.data, args.out, args.weights, phases[0], args.watch))
+        logger.info("weights: %s", make_near(args.data, args.out, args.weights, args.device))
 
 
 if __name__ == "__main__":

@@ -183,16 +183,13 @@ def check_folder(
     Raises:
         ConfigError, OutputError: If it holds another training, or something else.
     """
-    from edgeslam_torch.train.inputs import DataSet, Inputs, weights_name
+    from edgeslam_torch.train.folder import inputs, weights_name
     from edgeslam_torch.train.processes.distributed import by_first
     from edgeslam_torch.train.recipes.finetune import FromRuns, settings_of
 
-    expected = Inputs(
-        weights_name(*start),
-        tuple(DataSet(name, kind) for name, kind in sets),
-        tuple(DataSet(os.path.basename(os.path.abspath(path)), "depth") for path in args.validate),
-        settings_of(config, from_runs or FromRuns.TEACHER, reading, hooks),
-    )
+    validation = [os.path.basename(os.path.abspath(path)) for path in args.validate]
+    settings = settings_of(config, from_runs or FromRuns.TEACHER, reading, hooks)
+    expected = inputs(weights_name(*start), sets, validation, settings)
     by_first(lambda: out.check(expected))
 
 

@@ -34,10 +34,9 @@ class FlightPlan:
     height_spread_m: float = 0.3
     clearance_m: float = 0.45
     """Kept from walls and furniture."""
-    take_off: bool = True
-    """Start low and climb to the hover height, half a metre a second."""
     start_height_m: float = 0.4
-    """Where the climb starts: just after lift-off. On the floor a Tello's camera is at 0.07 m."""
+    """Where the climb to the hover height starts, half a metre a second: just after lift-off. On the floor a Tello's
+    camera is at 0.07 m."""
     glance_rad: float = np.deg2rad(25.0)
     """Maximum angle between heading and direction of flight."""
     view_m: float = 1.8

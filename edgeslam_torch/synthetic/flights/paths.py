@@ -3,6 +3,7 @@
 import numpy as np
 
 from edgeslam_torch.synthetic.flights.flight import KNOT_S, FlightPlan, Path
+from edgeslam_torch.synthetic.flights.wind import correlated
 from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.types import FloatArray
 
@@ -23,12 +24,9 @@ def inspect(rng: Rng, world: World, seconds: float, plan: FlightPlan) -> FloatAr
     """From the floor up and on from one free place to the next."""
     here = _free_place(rng, world, plan)
     yaw = _open_direction(rng, world, here)
-    rows = []
-    if plan.take_off:
-        floor = float(world.floor_below(here[None])[0]) + plan.start_height_m
-        rows += [[here[0], here[1], z, yaw] for z in np.arange(floor, here[2], 0.5 * KNOT_S)]
-    rows.append([*here, yaw])
-    return _cruise(rng, world, rows, seconds, plan)
+    floor = float(world.floor_below(here[None])[0]) + plan.start_height_m
+    rows = [[here[0], here[1], z, yaw] for z in np.arange(floor, here[2], 0.5 * KNOT_S)]
+    return _cruise(rng, world, [*rows, [*here, yaw]], seconds, plan)
 
 
 def hover_first(rng: Rng, world: World, seconds: float, plan: FlightPlan, turning: bool = False) -> FloatArray:
@@ -57,9 +55,7 @@ def turn(rng: Rng, world: World, seconds: float, plan: FlightPlan) -> FloatArray
     """Round and round on the spot at the plan's yaw rate, drifting some centimetres as a hovering drone does."""
     here = _free_place(rng, world, plan)
     steps = int(seconds / KNOT_S) + 1
-    drift = np.zeros((steps, 3))
-    for k in range(1, steps):
-        drift[k] = 0.8 * drift[k - 1] + rng.normal(0.0, _DRIFT_M, 3)
+    drift = correlated(np.concatenate([np.zeros((1, 3)), rng.normal(0.0, _DRIFT_M, (steps - 1, 3))]), 0.8)
     yaw = _open_direction(rng, world, here) + plan.yaw_rate_rad_s * KNOT_S * np.arange(steps)
     return np.column_stack([here + drift, yaw])
 
@@ -74,7 +70,6 @@ def around(sides_m: tuple[float, float]) -> Path:
         start_m = 0.5 * sides_m[0] - 1.0
         low = world.bounds_w[0, 2]
         risen = np.arange(low + plan.start_height_m, low + plan.hover_height_m, 0.5 * KNOT_S)
-        risen = risen if plan.take_off else risen[:0]
         way = [start_m] * (len(risen) + 1)
         while len(way) * KNOT_S < seconds:
             near = _to_corner(way[-1], sides_m) < _AROUND_M

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.synthetic.flights.wind import correlated
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
 GRAVITY_M_S2 = 9.81
@@ -32,8 +33,6 @@ class TelemetryFaults:
     """Standard deviation of arrival times."""
     loss: float = 0.0
     """Share of packets lost."""
-    outages_s: tuple[tuple[float, float], ...] = ()
-    """Intervals of the video's clock without any packet."""
     velocity_noise_m_s: float = 0.03
     velocity_walk: float = 0.003
     """Random walk of the velocity bias [m/s per sqrt(s)] on a full battery."""
@@ -148,7 +147,9 @@ def simulate(
     ypr = rotation.as_euler("ZYX")
     yaw0 = float(Rotation.from_matrix(T_w_b[0, :3, :3]).as_euler("ZYX")[0])
     p_w = path(moments)
-    floor = _floor(floor_m, t, p_w, moments)
+    floor = p_w[:, 2].min() - 0.1 if floor_m is None else floor_m
+    if np.ndim(floor):
+        floor = np.asarray(floor)[np.clip(np.searchsorted(t, moments), 0, len(t) - 1)]
     R_p_w = Rotation.from_euler("z", -yaw0)  # world to power-on axes
     velocity = R_p_w.apply(_mean_velocity(path, t, moments, 1.0 / faults.rate_hz))
     battery = np.maximum(faults.battery_start - (moments - t[0]) / faults.flight_time_s, 0.0)
@@ -180,18 +181,7 @@ def simulate(
     arrival = moments - faults.video_delay_s
     arrival = np.maximum.accumulate(arrival + faults.jitter_s * np.abs(rng.standard_normal(len(arrival))))
     kept = rng.random(len(arrival)) >= faults.loss
-    for start, end in faults.outages_s:
-        kept &= (arrival < start) | (arrival >= end)
     return TelemetryLog(arrival[kept], rows[kept])
-
-
-def _floor(floor_m: FloatArray | float | None, t: FloatArray, p_w: FloatArray, moments: FloatArray) -> FloatArray:
-    if floor_m is None:
-        return np.full(len(moments), p_w[:, 2].min() - 0.1)
-    if np.ndim(floor_m) == 0:
-        return np.full(len(moments), float(floor_m))
-    nearest = np.clip(np.searchsorted(t, moments), 0, len(t) - 1)
-    return np.asarray(floor_m)[nearest]
 
 
 def _mean_velocity(path: CubicSpline, t: FloatArray, moments: FloatArray, span_s: float) -> FloatArray:
@@ -212,21 +202,13 @@ def _drift(rng: np.random.Generator, battery: FloatArray, faults: TelemetryFault
     dt = 1.0 / faults.rate_hz
     kick = faults.velocity_walk * np.sqrt(dt) * (1.0 + faults.sag * (1.0 - battery))
     steps = kick[:, None] * rng.standard_normal((len(battery), 3))
-    keep = np.exp(-dt / faults.bias_memory_s)
-    bias = np.zeros_like(steps)
-    for k in range(1, len(steps)):
-        bias[k] = keep * bias[k - 1] + steps[k]
-    return bias
+    return correlated(steps, np.exp(-dt / faults.bias_memory_s))
 
 
 def _slow_noise(rng: np.random.Generator, count: int, sigma: float) -> FloatArray:
     """Noise with a correlation time of two seconds at 10 Hz and standard deviation ``sigma``."""
     keep = 0.95
-    steps = np.sqrt(1 - keep**2) * sigma * rng.standard_normal(count)
-    out = np.zeros(count)
-    for k in range(1, count):
-        out[k] = keep * out[k - 1] + steps[k]
-    return out
+    return correlated(np.sqrt(1 - keep**2) * sigma * rng.standard_normal(count), keep)
 
 
 def _quantised(rows: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.signal import lfilter
 
 from edgeslam_torch.types import FloatArray
 
@@ -33,9 +34,7 @@ def blown(
     times = stamps_s[0] + STEP_S * np.arange(count)
     keep = np.exp(-STEP_S / GUST_S)
     shocks = rng.normal(0.0, gust_m_s2 * np.sqrt(1.0 - keep**2), (count, 3)) * (1.0, 1.0, VERTICAL)
-    gust = np.zeros((count, 3))
-    for k in range(1, count):
-        gust[k] = keep * gust[k - 1] + shocks[k]
+    gust = correlated(shocks, keep)
     state = np.zeros((count, 2, 3))
     A = np.array([[0.0, 1.0], [-STIFFNESS_S2, -DAMPING_S]])
     over_step = expm(A * STEP_S)
@@ -49,3 +48,8 @@ def blown(
         np.stack([np.interp(stamps_s, times, x[:, k]) for k in range(3)], 1) for x in (*state.swapaxes(0, 1), lean)
     ]
     return sampled[0], sampled[1], sampled[2]
+
+
+def correlated(steps: FloatArray, keep: float) -> FloatArray:
+    """Noise with a memory, from zero on: ``keep`` times the value before plus a step, along the first axis."""
+    return np.asarray(lfilter([1.0], [1.0, -keep], np.concatenate([0.0 * steps[:1], steps[1:]]), axis=0))

@@ -18,6 +18,8 @@ from edgeslam_torch.synthetic.textures.image_ops import looked_up
 from edgeslam_torch.types import FloatArray
 
 NEAR_M = 0.02
+BACKGROUND = 90
+"""Grey level where nothing is hit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +98,7 @@ def _drawn(
     """Image, inverse depth, and quad index int16."""
     polygons = _project(world, camera, T_w_c)
     iz, ids, spans = _depth_pass(polygons, camera.width, camera.height, 0.0)
-    image = np.empty((camera.height, camera.width, 3), np.uint8)
-    image[:] = np.array(world.background, np.uint8)
+    image = np.full((camera.height, camera.width, 3), BACKGROUND, np.uint8)
     seen = np.bincount(ids.ravel() + 1, minlength=len(world.quads) + 1)[1:] > 0
     for polygon, roi in zip(polygons, spans.roi.tolist(), strict=True):
         if seen[polygon.quad]:

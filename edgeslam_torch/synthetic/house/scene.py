@@ -191,10 +191,8 @@ class Scene:
         corner = np.array(centre) - 0.5 * u - 0.5 * v
         self.surface(place.point(corner), place.direction(u), place.direction(v), paint, name)
 
-    def prism(
-        self, place: Place, radius: float, height: float, paint: Paint, name: str, *, sides: int = 8, top: float = 1.0
-    ) -> None:
-        """Add a closed column with an even number of sides; ``top`` scales the upper radius."""
+    def prism(self, place: Place, radius: float, height: float, paint: Paint, name: str, *, sides: int = 8) -> None:
+        """Add a closed column with an even number of sides."""
         r = radius * np.cos(np.pi / sides)
         self.boxes.append(Box(place.point(np.array([0, 0, height / 2])), np.array([r, r, height / 2]), place.yaw_rad))
         solid = len(self.boxes) - 1
@@ -202,14 +200,10 @@ class Scene:
         ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(sides)], axis=1) * radius
         lift = np.array([0.0, 0.0, height])
         for k in range(sides):
-            a, b = ring[k], ring[(k + 1) % sides]
-            # A tapered side is a trapezium; the parallelogram through its middle line is close enough.
-            slope = 0.5 * (a + b) * (top - 1.0)
-            v = -(lift + slope)
-            self.surface(place.point(a - v), place.direction(b - a), place.direction(v), paint, name, solid=solid)
-        path = [(ring[(k + 1) % sides] - ring[k]) * top for k in range(sides // 2)]
-        start = ring[0] * top + lift
-        for origin, u, v in _rhombi(start, path):
+            top, side = place.point(ring[k] + lift), place.direction(ring[(k + 1) % sides] - ring[k])
+            self.surface(top, side, place.direction(-lift), paint, name, solid=solid)
+        path = [ring[(k + 1) % sides] - ring[k] for k in range(sides // 2)]
+        for origin, u, v in _rhombi(ring[0] + lift, path):
             self.surface(place.point(origin), place.direction(v), place.direction(u), paint, name, solid=solid)
 
     def world(self, name: str) -> World:

@@ -1,7 +1,5 @@
 """Camera poses and views, and varied rooms to train depth on."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
@@ -146,13 +144,12 @@ def _close_up(rng: Rng, world: World, ceiling_m: float) -> FloatArray | None:
     return None
 
 
-def random_view(rng: Rng, camera: Camera, world: World | None = None) -> Rendered:
-    """An exact view from a sensible place of ``world`` (a new `random_room` if None).
+def random_view(rng: Rng, camera: Camera, world: World) -> Rendered:
+    """An exact view from a sensible place of ``world``.
 
     A preview of 40 x 30 pixels rejects views of something nearer than arm's length.
     """
-    world = world or random_room(rng)
-    small = replace(camera, distortion=(0.0,) * 5).scaled(40, 30)
+    small = camera.scaled(40, 30)
     for _ in range(12):
         T_w_c = random_pose(rng, world)
         depth = render(world, small, T_w_c, antialias=False).depth_m

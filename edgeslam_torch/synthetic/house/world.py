@@ -160,7 +160,6 @@ class World:
         name: str = "world",
         bounds_w: FloatArray | None = None,
         boxes: list[Box] | None = None,
-        background: tuple[int, int, int] = (90, 90, 90),
         unseen: Sequence[Box] = (),
     ) -> None:
         """Args: ``bounds_w`` ``(2, 3)`` free space, low and high corner; ``boxes`` the solids inside it; ``unseen``
@@ -170,7 +169,6 @@ class World:
         self.quads = tuple(quads)
         self.name = name
         self.boxes = tuple(boxes or [])
-        self.background = background
         self.unseen = tuple(unseen)
         self.corners_w = np.stack([q.corners_w for q in quads])
         self.normals_w = np.stack([q.normal_w for q in quads])

@@ -19,7 +19,7 @@ def mirrored(world: World) -> World:
     wall = float(world.bounds_w[1, 0])
     kept = [q for q in world.quads if (q.corners_w[:, 0] < wall - _ON_WALL_M).any()]
     behind = [_reflected(q, wall) for q in kept]
-    return World([*kept, *behind], world.name, world.bounds_w, list(world.boxes), world.background, world.unseen)
+    return World([*kept, *behind], world.name, world.bounds_w, list(world.boxes), world.unseen)
 
 
 def _reflected(quad: Quad, wall: float) -> Quad:

@@ -79,11 +79,9 @@ def test_video_delay_stamps_telemetry_earlier(flight):
     np.testing.assert_array_equal(logs[0].rows, logs[1].rows)
 
 
-def test_loss_and_outage_drop_packets(flight):
-    faults = TelemetryFaults(loss=0.3, outages_s=((10.0, 20.0),))
-    log = simulated(flight, faults)
-    assert not np.any((log.stamps_s >= 10.0) & (log.stamps_s < 20.0))
-    assert 0.5 < len(log.stamps_s) / 200 < 0.9
+def test_loss_drops_packets(flight):
+    log = simulated(flight, TelemetryFaults(loss=0.3))
+    assert 0.6 < len(log.stamps_s) / len(simulated(flight).stamps_s) < 0.8
     assert np.all(np.diff(log.stamps_s) >= 0)
 
 

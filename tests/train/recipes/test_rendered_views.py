@@ -53,9 +53,8 @@ def test_a_place_depends_on_its_number_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(rendered_views, "NEAR_VIEWS", 1)
     monkeypatch.setattr(rendered_views, "WIDTH", 64)
     monkeypatch.setattr(rendered_views, "HEIGHT", 48)
-    monkeypatch.setattr(rendered_views, "PLACES_A_FILE", 2)
     for name, count in (("one", 1), ("two", 2)):
-        rendered_views._render_file((tmp_path / name, 0, count, 21))
+        rendered_views._render_file((tmp_path / name, rendered_views.place_views, range(count), 21))
     with np.load(tmp_path / "one") as one, np.load(tmp_path / "two") as two:
         assert 0 < len(one["image"]) < len(two["image"])
         for name in ("image", "depth", "K"):
@@ -67,6 +66,7 @@ def test_a_place_depends_on_its_number_alone(tmp_path, monkeypatch):
 def test_files_that_are_there_stay(tmp_path):
     kept = tmp_path / "places_00000.npz"
     kept.write_bytes(b"kept")
-    rendered_views.render_files(tmp_path, rendered_views.PLACES_A_FILE)
+    count = rendered_views.PLACES_A_FILE
+    assert rendered_views.render_files(tmp_path, rendered_views.place_views, count, 21) == [kept]
     assert kept.read_bytes() == b"kept"
     assert list(tmp_path.iterdir()) == [kept]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.train.inputs import labelled_set
+from edgeslam_torch.train import folder
 from edgeslam_torch.train.recipes.finetune import HELD_OUT, MOST_HELD_OUT, _split
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import DepthFolder
@@ -111,11 +111,11 @@ def test_shards_that_are_none_are_named(tmp_path):
 
 def test_record_changes_with_the_content_and_reads_no_sample(tmp_path):
     write_shards(views(3), tmp_path, "flight")
-    first = labelled_set(load_shards(tmp_path))
-    assert first.images == 3
-    assert labelled_set(load_shards(tmp_path)) == first
+    first = folder.content(load_shards(tmp_path))
+    assert first.startswith("3, ")
+    assert folder.content(load_shards(tmp_path)) == first
     write_shards(views(4)[1:], tmp_path, "flight")
-    assert labelled_set(load_shards(tmp_path)) != first
+    assert folder.content(load_shards(tmp_path)) != first
 
 
 class _Counted(list[View]):
