@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from torch import nn
 
+from edgeslam_torch import __version__
 from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.loop import BEST, CURVE, FINAL, LAST
-from edgeslam_torch.train.processes.distributed import by_first, rank
+from edgeslam_torch.train.processes.distributed import by_first, rank, world
 from edgeslam_torch.train.result import TrainingResult
 from edgeslam_torch.train.state import saved_step
 from edgeslam_torch.train.views.datasets import DepthFolder
@@ -174,12 +175,15 @@ class OutFolder:
             OSError: If the file cannot be written.
         """
         self.check(given)
-        record = self._record()
-        resumes = record is not None and self.existing is not Existing.OVERWRITE
+        record = self._record() if self.existing is not Existing.OVERWRITE else None
         # One that was interrupted before the first step may have left its teacher's depth.
-        if not resumes or (not self.step and record and differences(record["given"], given, WITH_RESUME)):
+        if record is None or (not self.step and differences(record["given"], given, WITH_RESUME)):
             self._clear()
-        self._write({"given": given, "outcome": None})
+            record = None
+        session = {"from_step": self.step, "processes": world(), "version": __version__}
+        session |= {name: given[name] for name in WITH_RESUME if name in given}
+        sessions = [*(record["sessions"] if record is not None else ()), session]
+        self._write({"given": given, "sessions": sessions, "outcome": None})
 
     def finished(self, given: Inputs) -> TrainingResult | None:
         """Result of an identical earlier training, if any."""
@@ -216,7 +220,7 @@ class OutFolder:
             record = json.loads(path.read_text(encoding="utf-8"))
             if record["outcome"] is not None:
                 TrainingResult.from_json(record["outcome"], self.path / WEIGHTS)
-            return {"given": dict(record["given"]), "outcome": record["outcome"]}
+            return {"given": dict(record["given"]), "sessions": list(record["sessions"]), "outcome": record["outcome"]}
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise OutputError(f"{path}: unreadable ({type(error).__name__}); give another --out") from error
 

@@ -18,16 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from edgeslam_torch import __version__
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.experiment.conditions import code_state, machine, orb_pass_ms
-from edgeslam_torch.eval.experiment.figures import Figure, grouped, markdown_comparison, other_conditions
+from edgeslam_torch.eval.experiment.conditions import code_state, machine, orb_pass_ms, stamp
+from edgeslam_torch.eval.experiment.figures import Figure, grouped
 from edgeslam_torch.eval.experiment.runner import MODULE, Local, Task, run_tasks
 from edgeslam_torch.eval.experiment.tables import markdown_table
 from edgeslam_torch.eval.inputs.dataset import find_recordings
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.jobs.watched import Limits, start_module
 
 FORMAT = 3
@@ -108,7 +106,8 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
         folders[SYNTHETIC] = _record_synthetic(out, settings, say)
     record: dict[str, Any] = {
         "format": FORMAT,
-        **conditions(),
+        **stamp(),
+        "machine": machine(),
         **asked(settings),
         "mode": settings.mode,
         "runs": run_rows(settings, folders, {"": ((), "")}, out, say)[""],
@@ -116,12 +115,6 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
     }
     write_text(out / "bench.json", json.dumps(record, indent=1, default=str) + "\n")
     return record
-
-
-def conditions() -> dict[str, Any]:
-    """Of all runs of a record."""
-    made = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    return {"version": __version__, "commit": code_state(), "made": made, "machine": machine()}
 
 
 def asked(settings: BenchSettings) -> dict[str, Any]:
@@ -261,28 +254,9 @@ def _one_line(run: dict[str, Any]) -> str:
     return text + (f", {f['cpu_ms_per_frame']:.0f} ms CPU per frame" if f.get("cpu_ms_per_frame") else "")
 
 
-def read_record(path: Path) -> dict[str, Any]:
-    """A record that `run_benchmark` wrote.
-
-    Raises:
-        EvaluationError: If the file is missing or no such record.
-    """
-    record = read_mapping(path, "JSON", EvaluationError)
-    if record.get("format") not in range(1, FORMAT + 1) or "runs" not in record:
-        raise EvaluationError(f"{path}: not a result of 'edgeslam bench' (format {FORMAT})")
-    return record
-
-
 def read_peers(path: Path = _PEERS) -> list[dict[str, Any]]:
     """Stored figures of other systems, each with its source and conditions."""
     return list(tomllib.loads(path.read_text(encoding="utf-8"))["peer"])
-
-
-def markdown_compare(before: dict[str, Any], after: dict[str, Any]) -> str:
-    """Medians of two records and what differs by more than the noise, and what to beware of."""
-    table = markdown_comparison(grouped(before["runs"], "sequence"), grouped(after["runs"], "sequence"), FIGURES)
-    head = f"{before.get('commit')} -> {after.get('commit')}, medians, ratio; ! worse, + better by more than the noise"
-    return "\n".join([head, *other_conditions(before, after), "", table])
 
 
 def markdown_bench(record: dict[str, Any]) -> str:

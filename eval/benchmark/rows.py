@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edgeslam_torch.eval.benchmark.benchmark import FIGURES, BenchSettings, asked, conditions, run_rows, sequences
+from edgeslam_torch.eval.benchmark.benchmark import FIGURES, BenchSettings, asked, run_rows, sequences
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.experiment.conditions import machine, stamp
 from edgeslam_torch.eval.experiment.figures import Figure, changes, grouped
 from edgeslam_torch.eval.experiment.tables import markdown_table
 from edgeslam_torch.files.atomic import write_text
@@ -68,7 +69,7 @@ def run_ablation(
     rows = {name: (row.set, row.first) for name, row in ROWS.items() if name in wanted}
     found = run_rows(settings, sequences(settings), rows, out, say)
     kept = {name: {"runs": [_kept(run) for run in found.get(name, [])]} for name in ROWS}
-    record = conditions() | {"settings": asked(settings), "rows": kept}
+    record = stamp() | {"machine": machine(), "settings": asked(settings), "rows": kept}
     write_text(out / "ablation.json", json.dumps(record, indent=1) + "\n")
     return record
 

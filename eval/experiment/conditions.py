@@ -35,6 +35,12 @@ def machine() -> dict[str, Any]:
     }
 
 
+def stamp(commit: str | None = None) -> dict[str, Any]:
+    """Of which code and when a record is; ``commit`` is read from git when None."""
+    made = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    return {"version": __version__, "commit": commit or code_state(), "made": made}
+
+
 def orb_pass_ms() -> float:
     """CPU time of one pass of ORB (1000 features) over one 640 x 480 image: the unit that costs are stated in.
 

@@ -4,13 +4,16 @@ Two medians differ by chance by ``2 sqrt(s_a^2/n_a + s_b^2/n_b)``, with ``s`` th
 seeds, and never by less than a figure's floor, for what one record cannot see of itself.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.tables import markdown_table
+from edgeslam_torch.files.record_files import read_mapping
 
 _SIGMAS = 2.0
 _MOST_NAMED = 8
@@ -119,6 +122,37 @@ def markdown_comparison(before: Groups, after: Groups, figures: Sequence[Figure]
     if any(len(runs) == 1 for name in names for runs in (before[name], after[name])):
         text += ["with one seed the scatter is not known: only the floors of the figures are applied"]
     return "\n".join(text) + "\n"
+
+
+def compared(
+    before: Mapping[str, Any], after: Mapping[str, Any], rows: str, name: str, figures: Sequence[Figure]
+) -> str:
+    """Two records side by side, and what to beware of.
+
+    Args:
+        before: A record.
+        after: Another one.
+        rows: Key of a record's runs.
+        name: Key of a run's source.
+        figures: What is compared.
+    """
+    head = f"{before.get('commit')} -> {after.get('commit')}, medians, ratio; ! worse, + better by more than the noise"
+    table = markdown_comparison(grouped(before[rows], name), grouped(after[rows], name), figures)
+    return "\n".join([head, *other_conditions(before, after), "", table])
+
+
+def read_record(path: Path, command: str, formats: Container[int], rows: str) -> dict[str, Any]:
+    """A record that an ``edgeslam`` command wrote, with a list of runs under the key ``rows``.
+
+    Raises:
+        EvaluationError: If the file is missing or no such record.
+    """
+    record = read_mapping(path, "JSON", EvaluationError)
+    runs = record.get(rows)
+    is_list = isinstance(runs, list) and all(isinstance(run, dict) for run in runs)
+    if record.get("format") not in formats or not is_list:
+        raise EvaluationError(f"{path}: not a result of 'edgeslam {command}' of this version")
+    return record
 
 
 def other_conditions(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:

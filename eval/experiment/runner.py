@@ -106,16 +106,14 @@ class Local:
         return Job(folder, folder / LOG, self.start, self.limits)
 
 
-def run_tasks(
-    tasks: Mapping[T, Task], runner: Runner, resume: bool = True
-) -> Generator[tuple[T, dict[str, Any] | None, Ended | None]]:
+def run_tasks(tasks: Mapping[T, Task], runner: Runner) -> Generator[tuple[T, dict[str, Any] | None, Ended | None]]:
     """Each case with its result and the end of its process: stored results first, without an end, then as they come.
 
     The result is None for a case that failed.
     """
     waiting = []
     for case, task in tasks.items():
-        found = task.result() if resume else None
+        found = task.result()
         if found is None:
             waiting.append(case)
         else:

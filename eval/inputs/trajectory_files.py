@@ -20,6 +20,7 @@ from edgeslam_torch.files.tables import Table, read_table
 from edgeslam_torch.files.time_units import UNKNOWN, seconds_of
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray
+from edgeslam_torch.writers.run_writer import tum_line
 
 SEVEN_SCENES_HZ = 30.0
 """The 7-Scenes files carry no stamps; the sensor ran at 30 Hz."""
@@ -107,11 +108,8 @@ def read_trajectory(path: Path | str, stamps_s: FloatArray | None = None) -> Tra
 
 def write_tum(trajectory: Trajectory, path: Path | str) -> None:
     """Write ``t tx ty tz qx qy qz qw``, camera to world."""
-    rows = [
-        f"{stamp:.6f} " + " ".join(f"{x:.9f}" for x in se3.pose_to_tum(T))
-        for stamp, T in zip(trajectory.stamps_s, trajectory.T_w_c, strict=True)
-    ]
-    write_text(Path(path), "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n")
+    rows = map(tum_line, trajectory.stamps_s, trajectory.T_w_c)
+    write_text(Path(path), "# timestamp tx ty tz qx qy qz qw\n" + "".join(rows))
 
 
 def _read_folder(folder: Path) -> Trajectory:

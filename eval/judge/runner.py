@@ -1,14 +1,12 @@
 """The judge: all cells in processes of their own, and one record of their figures; an interrupted judge resumes."""
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edgeslam_torch import __version__
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.experiment.conditions import code_state
+from edgeslam_torch.eval.experiment.conditions import code_state, stamp
 from edgeslam_torch.eval.experiment.runner import CASE, Local, Runner, Task, run_tasks
 from edgeslam_torch.eval.judge.cells import Cell
 from edgeslam_torch.files.record_files import read_mapping
@@ -81,27 +79,11 @@ def judge(
     rows |= {cell: _row(cell, found) for cell in others if (found := task(cell).result()) is not None}
     return {
         "format": FORMAT,
-        "version": __version__,
-        "commit": commit,
-        "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        **stamp(commit),
         "overrides": list(settings.overrides),
         "max_frames": settings.max_frames,
         "rows": sorted(rows.values(), key=_order),
     }
-
-
-def read_record(folder: Path) -> dict[str, Any]:
-    """The record in a judge's output folder.
-
-    Raises:
-        EvaluationError: If there is none.
-    """
-    path = folder / RECORD
-    record = read_mapping(path, "JSON", EvaluationError)
-    rows = record.get("rows")
-    if record.get("format") != FORMAT or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise EvaluationError(f"{path}: not a result of 'edgeslam judge' (format {FORMAT})")
-    return record
 
 
 def _order(row: dict[str, Any]) -> tuple[bool, str, int]:

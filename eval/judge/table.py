@@ -1,9 +1,9 @@
-"""The judge's record as a table that is Markdown too, one line a cell and every run below it; two records compared."""
+"""The judge's record as a table that is Markdown too, one line a cell and every run below it."""
 
 from collections.abc import Sequence
 from typing import Any
 
-from edgeslam_torch.eval.experiment.figures import grouped, markdown_comparison, other_conditions
+from edgeslam_torch.eval.experiment.figures import grouped
 from edgeslam_torch.eval.experiment.tables import markdown_table
 from edgeslam_torch.eval.judge.score import COLUMNS
 from edgeslam_torch.eval.judge.thresholds import Row, Threshold, verdicts_of_cell, verdicts_of_groups
@@ -37,13 +37,6 @@ def markdown(record: dict[str, Any], thresholds: Sequence[Threshold]) -> str:
     if len(rows) > len(cells):
         parts += ["", "Every run:", "", markdown_table(header[:-1], [[_run_name(row), *_cells([row])] for row in rows])]
     return "\n".join(parts) + "\n"
-
-
-def markdown_against(before: dict[str, Any], after: dict[str, Any]) -> str:
-    """Both records' medians and their ratio, cell by cell."""
-    head = f"{before['commit']} -> {after['commit']}, medians, ratio; ! worse, + better by more than the noise"
-    table = markdown_comparison(grouped(before["rows"], "cell"), grouped(after["rows"], "cell"), COLUMNS)
-    return "\n".join([head, *other_conditions(before, after), "", table])
 
 
 def _conditions(record: dict[str, Any]) -> str:

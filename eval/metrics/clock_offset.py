@@ -26,9 +26,9 @@ class Offset:
     """That ATE over what a fixed position would score in the same time: 1 is no fit at all."""
 
 
-def best_offset(truth: Trajectory, estimate: Trajectory, reach_s: float = NEAR_S) -> Offset:
-    """The offset within ``±reach_s`` under which the shapes fit best."""
-    reach = min(reach_s, 0.5 * float(np.ptp(estimate.stamps_s)))
+def best_offset(truth: Trajectory, estimate: Trajectory) -> Offset:
+    """The offset within `NEAR_S` to either side under which the shapes fit best."""
+    reach = min(NEAR_S, 0.5 * float(np.ptp(estimate.stamps_s)))
     return _search(truth, estimate, -reach, reach)
 
 

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import nearest
 from edgeslam_torch.eval.inputs.dataset import EvalDataset, interpolate, open_dataset
+from edgeslam_torch.eval.metrics.depth_error import edge_mask
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.images import pixels_or_none
@@ -31,8 +32,6 @@ _EDGE_FRAMES, _SINGLE_FRAMES = 40, 30
 """Depth maps used for reference edges, and to judge a point one by one, evenly spaced over the sequence."""
 _HIDDEN_M = 0.1
 """A point this far behind a depth map's surface is hidden there and cannot be compared with that map."""
-_CANNY = (50.0, 150.0)
-"""Canny thresholds of the reference edges, on the grey image smoothed with sigma 1, L2 gradient."""
 _HOLE_PX, _NEAR_PX = 4, 2
 """Distance of reference edges from unmeasured pixels, where depth is unreliable, at least; and that within which the
 nearest depth is an edge's: it belongs to the occluding side."""
@@ -182,8 +181,7 @@ def _edge_points(dataset: EvalDataset, measured: DepthMaps, depth: FloatArray, i
     T_c_d, camera = measured.T_c_d, dataset.camera
     if not measured.is_registered:
         depth = register_depth(depth, measured.taken_by(camera), T_c_d, camera)
-    image = cv2.GaussianBlur(camera.undistort_image(image), (0, 0), 1.0)
-    canny = cv2.Canny(image, *_CANNY, L2gradient=True) > 0
+    canny = edge_mask(np.asarray(camera.undistort_image(image), np.uint8))
     hole, near = (np.ones((2 * px + 1,) * 2, np.uint8) for px in (_HOLE_PX, _NEAR_PX))
     solid = cv2.erode((depth > 0).astype(np.uint8), hole, borderValue=0) > 0
     nearest_m = cv2.erode(np.where(depth > 0, depth, np.float32(1e3)), near)

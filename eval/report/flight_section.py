@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from edgeslam_torch.eval.report.line_drawings import chart, view
+from edgeslam_torch.eval.report.words import number
 from edgeslam_torch.files.plain import open_plain
 
 _MOMENTS = "moments.csv"
@@ -23,7 +24,9 @@ def flight_section(folder: Path | None) -> str:
     rows = [] if folder is None else _rows(folder / _MOMENTS)
     if folder is None or not rows:
         return ""
-    table = {name: np.array([_number(row, name) for row in rows]) for name in ("stamp_s", "x_m", "y_m", "clearance_m")}
+    table = {
+        name: np.array([number(row.get(name)) for row in rows]) for name in ("stamp_s", "x_m", "y_m", "clearance_m")
+    }
     good = np.isfinite(table["stamp_s"]) & np.isfinite(table["x_m"]) & np.isfinite(table["y_m"])
     if good.sum() < 2:
         return ""
@@ -53,7 +56,7 @@ def _rows(path: Path, needed: tuple[str, ...] = _NEEDED) -> list[dict[str, str]]
 
 def _across(row: dict[str, str]) -> np.ndarray | None:
     """The opening as a line ``(2, 2)`` from jamb to jamb; None if its numbers are none."""
-    x, y, nx, ny, width = (_number(row, name) for name in _EXIT_NEEDED)
+    x, y, nx, ny, width = (number(row.get(name)) for name in _EXIT_NEEDED)
     ends = np.array([[x, y], [x, y]]) + 0.5 * width * np.array([[-ny, nx], [ny, -nx]])
     return ends if np.isfinite(ends).all() else None
 
@@ -63,13 +66,6 @@ def _exit_words(exits: list[np.ndarray]) -> str:
         return ""
     widths = ", ".join(f"{np.linalg.norm(line[1] - line[0]):.1f} m" for line in exits)
     return f" {len(exits)} exit{'s' if len(exits) > 1 else ''} found (red), {widths} wide."
-
-
-def _number(row: dict[str, str], name: str) -> float:
-    try:
-        return float(row.get(name) or "nan")
-    except ValueError:
-        return float("nan")
 
 
 def _words(seconds: np.ndarray, way: np.ndarray, clearance: np.ndarray) -> str:
@@ -86,7 +82,7 @@ def _events(rows: list[dict[str, str]], seconds: np.ndarray) -> str:
     for row, t in zip(rows, seconds, strict=True):
         state = (row["phase"], row["danger"])
         if state != before:
-            place = f"({_number(row, 'x_m'):.1f}, {_number(row, 'y_m'):.1f})"
+            place = f"({number(row['x_m']):.1f}, {number(row['y_m']):.1f})"
             cells = (f"{t:.1f}", place, row["phase"], row["danger"], row["why"])
             out.append("<tr>" + "".join(f"<td>{html.escape(cell or '')}</td>" for cell in cells) + "</tr>")
         before = state

@@ -166,7 +166,7 @@ class _StatusTable:
 
     def __init__(self, run: RunFolder, trajectory: Trajectory) -> None:
         self.all_rows = run.status
-        self.all_stamps = np.array([_number(r, "stamp_s") for r in run.status], dtype=np.float64)
+        self.all_stamps = np.array([words.number(r.get("stamp_s")) for r in run.status], dtype=np.float64)
         self.rows: list[dict[str, str]] = []
         if len(self.all_stamps) and np.isfinite(self.all_stamps).all():
             order = np.argsort(self.all_stamps, kind="stable")
@@ -181,7 +181,7 @@ class _StatusTable:
 
     def column(self, name: str) -> list[float | None] | None:
         """Numbers of a column, None where missing; None when the file lacks it."""
-        values = [_number(r, name) for r in self.rows]
+        values = [words.number(r.get(name)) for r in self.rows]
         if not any(np.isfinite(values)):
             return None
         return [round(v, 5) if np.isfinite(v) else None for v in values]
@@ -212,7 +212,7 @@ class _StatusTable:
         names = [n for n in (self.all_rows[0] if self.all_rows else {}) if n.endswith("_ms")]
         out = []
         for name in names:
-            values = np.array([_number(r, name) for r in self.all_rows])
+            values = np.array([words.number(r.get(name)) for r in self.all_rows])
             values = values[np.isfinite(values) & (values > 0)]
             if len(values):
                 label = "whole step" if name == "step_ms" else name.removesuffix("_ms").replace("_", " ")
@@ -243,11 +243,6 @@ class _StatusTable:
 def _status_code(row: dict[str, str]) -> int:
     status = row.get("status", "tracked")
     return STATUSES.index(status) if status in STATUSES else STATUSES.index("lost")
-
-
-def _number(row: dict[str, str], name: str) -> float:
-    value = words.number(row.get(name))
-    return value if np.isfinite(value) else float("nan")
 
 
 def upright(trajectory: Trajectory, score: RunScore | None, truth: Trajectory | None) -> FloatArray:

@@ -21,11 +21,12 @@ _LEADING = re.compile(
 
 
 def number(value: object) -> float:
-    """A value of a file that may hold anything as a number; NaN if it is none."""
+    """A value of a file that may hold anything as a number; NaN if it is none, or not finite."""
     try:
-        return float(value)  # type: ignore[arg-type]
+        found = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         return math.nan
+    return found if math.isfinite(found) else math.nan
 
 
 def record(value: object) -> dict[str, Any]:

@@ -5,7 +5,6 @@ near ones (`place_views`).
 """
 
 from collections.abc import Callable, Iterator
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -70,21 +69,18 @@ def place_views(rng: Rng) -> Drawn:
             yield camera, rendered
 
 
-def render_files(folder: Path, views: Callable[[Rng], Drawn], places: int, seed: int, processes: int = 1) -> list[Path]:
+def render_files(folder: Path, views: Callable[[Rng], Drawn], places: int, seed: int) -> list[Path]:
     """Draw views of ``places`` places into ``folder``, `PLACES_A_FILE` a file, without most of the flat ones; place p
     depends on (seed, p) alone. Files that are there stay. Returns all of them, in the order of the places."""
     folder.mkdir(parents=True, exist_ok=True)
     firsts = range(0, places, PLACES_A_FILE)
     files = {folder / f"places_{first:05d}.npz": range(first, min(first + PLACES_A_FILE, places)) for first in firsts}
-    work = [(path, views, numbers, seed) for path, numbers in files.items() if not path.is_file()]
-    with get_context("spawn").Pool(processes) as pool:
-        for _ in counted(pool.imap(_render_file, work), "rendering places", "file", len(work)):
-            pass
+    for path in counted([path for path in files if not path.is_file()], "rendering places", "file"):
+        _render_file(path, views, files[path], seed)
     return list(files)
 
 
-def _render_file(work: tuple[Path, Callable[[Rng], Drawn], range, int]) -> None:
-    path, views, numbers, seed = work
+def _render_file(path: Path, views: Callable[[Rng], Drawn], numbers: range, seed: int) -> None:
     found = []
     for p in numbers:
         rng = np.random.default_rng((seed, p))

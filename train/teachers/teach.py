@@ -22,7 +22,7 @@ from edgeslam_torch.terminal.progress import counted
 from edgeslam_torch.train.processes.distributed import rank, share_of, wait_for_all
 from edgeslam_torch.train.teachers.densify import densify
 from edgeslam_torch.train.teachers.plane_sweep import sweep_depth
-from edgeslam_torch.train.views.augment import View, fitted_view
+from edgeslam_torch.train.views.augment import View, fitted_view, scaled_K
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView, relative_motion
 from edgeslam_torch.types import FloatArray
 
@@ -47,16 +47,6 @@ LOOKED_AT = 24
 
 Predict = Callable[[PosedView], FloatArray]
 """Depth [m] of every pixel of a view ``(H, W)`` by a network; NaN where it has none."""
-
-
-@dataclass(frozen=True, slots=True)
-class Swept:
-    """Depth of one view and its camera, at the size of the sweep."""
-
-    depth: FloatArray
-    """``(H, W)`` float32, in the run's unit."""
-    K: FloatArray
-    T_w_c: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +115,7 @@ def teach(predict: Predict, sequence: PosedSequence, log_scale: float, folder: P
         if not (path := folder / f"swept_{i}.npy").is_file():
             _save(path, _sweep(sequence, i))
     wait_for_all()
-    swept = {i: _swept(sequence.views[i], np.load(folder / f"swept_{i}.npy")) for i in with_partners}
+    swept = {i: (np.load(folder / f"swept_{i}.npy"), sequence.views[i]) for i in with_partners}
     for i in counted(share_of(chosen), f"{sequence.name}: depth elsewhere", "image", shown=rank() == 0):
         if not (path := folder / f"dense_{i}.npy").is_file():
             measured = _confirmed(swept, i) if i in swept else np.zeros((1, 1), np.float32)
@@ -153,44 +143,48 @@ def _sweep(sequence: PosedSequence, i: int) -> FloatArray:
     return sweep_depth(_grey(small), [_grey(_small(other)) for other in others], motions, small.K, inverse)
 
 
-def _swept(view: PosedView, depth: FloatArray) -> Swept:
-    return Swept(depth, _small(view).K, view.T_w_c)
-
-
 def _taught(view: PosedView, signed: FloatArray) -> Taught:
     return Taught(View(view.image, np.abs(signed), view.K), signed > 0)
 
 
-def _confirmed(swept: Mapping[int, Swept], i: int) -> FloatArray:
+Swept = Mapping[int, tuple[FloatArray, PosedView]]
+"""Depth of views ``(H, W)`` float32 at the size of the sweep, in the run's unit, by their number."""
+
+
+def _confirmed(swept: Swept, i: int) -> FloatArray:
     """Depth of view ``i`` where enough others agree, 0 elsewhere."""
-    this = swept[i]
-    height, width = this.depth.shape
+    depth, view = swept[i]
+    height, width = depth.shape
     u, v = np.meshgrid(np.arange(width), np.arange(height))
-    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(this.K).T
-    p_w = (rays * this.depth[..., None]) @ this.T_w_c[:3, :3].T + this.T_w_c[:3, 3]
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(_swept_K(view, depth)).T
+    p_w = (rays * depth[..., None]) @ view.T_w_c[:3, :3].T + view.T_w_c[:3, 3]
     agreeing = np.zeros((height, width), int)
     for j in _nearest(swept, i):
-        other = swept[j]
-        p_j = ((p_w - other.T_w_c[:3, 3]) @ other.T_w_c[:3, :3]).astype(np.float32)
+        other, seen = swept[j]
+        p_j = ((p_w - seen.T_w_c[:3, 3]) @ seen.T_w_c[:3, :3]).astype(np.float32)
         z = np.maximum(p_j[..., 2], 1e-6)
-        uv = (p_j / z[..., None]) @ other.K.T.astype(np.float32)
-        there = cv2.remap(other.depth, uv[..., 0], uv[..., 1], cv2.INTER_NEAREST, borderValue=0)
+        uv = (p_j / z[..., None]) @ _swept_K(seen, other).T.astype(np.float32)
+        there = cv2.remap(other, uv[..., 0], uv[..., 1], cv2.INTER_NEAREST, borderValue=0)
         agreeing += np.abs(there / z - 1.0) < TOLERANCE
-    return np.where(agreeing >= CONFIRMING, this.depth, 0.0).astype(np.float32)
+    return np.where(agreeing >= CONFIRMING, depth, 0.0).astype(np.float32)
 
 
-def _nearest(swept: Mapping[int, Swept], i: int) -> list[int]:
+def _swept_K(view: PosedView, depth: FloatArray) -> FloatArray:
+    (height, width), (h, w) = depth.shape, view.image.shape[:2]
+    return scaled_K(view.K, width / w, height / h)
+
+
+def _nearest(swept: Swept, i: int) -> list[int]:
     """The views most like view ``i``: little moved relative to its depth, little turned."""
-    this = swept[i]
-    away = float(np.median(this.depth))
-    others = [j for j in swept if j != i]
+    depth, view = swept[i]
+    away = float(np.median(depth))
 
     def distance(j: int) -> float:
-        relative = this.T_w_c[:3, :3].T @ swept[j].T_w_c[:3, :3]
-        turn = float(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1)))
-        return float(np.linalg.norm(this.T_w_c[:3, 3] - swept[j].T_w_c[:3, 3])) / away + 0.5 * turn
+        motion = relative_motion(swept[j][1], view)
+        turn = float(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1)))
+        return float(np.linalg.norm(motion[:3, 3])) / away + 0.5 * turn
 
-    return sorted(others, key=distance)[:ASKED]
+    return sorted((j for j in swept if j != i), key=distance)[:ASKED]
 
 
 def _completed(predict: Predict, view: PosedView, measured: FloatArray, log_scale: float) -> FloatArray:

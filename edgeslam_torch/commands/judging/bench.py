@@ -63,12 +63,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Run or compare; 1 when a run failed."""
     from edgeslam_torch.eval.benchmark import benchmark, rows
+    from edgeslam_torch.eval.experiment.figures import compared, read_record
 
     if args.navigation:
         return _navigation(args)
     if args.compare is not None:
-        before, after = (benchmark.read_record(path) for path in args.compare)
-        print(benchmark.markdown_compare(before, after))
+        formats = range(1, benchmark.FORMAT + 1)
+        before, after = (read_record(path, "bench", formats, "runs") for path in args.compare)
+        print(compared(before, after, "runs", "sequence", benchmark.FIGURES))
         return 0
     data = recordings(args.data)
     if args.get:

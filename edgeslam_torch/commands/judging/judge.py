@@ -50,17 +50,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Run the missing cells, print and write the table; 1 when a cell has no result."""
     from edgeslam_torch.config import SlamConfig
+    from edgeslam_torch.eval.experiment.figures import compared, read_record
     from edgeslam_torch.eval.judge.cells import list_cells
     from edgeslam_torch.eval.judge.release import command_outputs, release_cells, release_record
-    from edgeslam_torch.eval.judge.runner import RECORD, JudgeSettings, judge, read_record
-    from edgeslam_torch.eval.judge.table import markdown, markdown_against
+    from edgeslam_torch.eval.judge.runner import FORMAT, RECORD, JudgeSettings, judge
+    from edgeslam_torch.eval.judge.score import COLUMNS
+    from edgeslam_torch.eval.judge.table import markdown
     from edgeslam_torch.eval.judge.thresholds import THRESHOLDS, read_thresholds
     from edgeslam_torch.files.config_file import load_config
 
     load_config(SlamConfig(), None, args.set)  # a setting that does not exist is said before anything is run
     data = recordings(args.data)
     thresholds = read_thresholds(args.thresholds or THRESHOLDS)
-    before = read_record(args.against) if args.against is not None else None
+    before = read_record(args.against / RECORD, "judge", (FORMAT,), "rows") if args.against is not None else None
     if args.jobs < 1 or args.seeds < 1 or args.first_seed < 0:
         raise ConfigError("--jobs and --seeds must be at least 1, --first-seed at least 0")
     if args.release is not None and (args.only or args.set or args.max_frames):
@@ -75,7 +77,7 @@ def main(args: argparse.Namespace) -> int:
         record = judge(cells, settings, args.out, say)
         text = markdown(record, thresholds)
         if before is not None:
-            text += "\n" + markdown_against(before, record)
+            text += "\n" + compared(before, record, "rows", "cell", COLUMNS)
         write_text(args.out / RECORD, json.dumps(record, indent=1) + "\n")
         write_text(args.out / "judge.md", text)
         if args.release is not None:

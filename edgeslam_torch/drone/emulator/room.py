@@ -40,7 +40,7 @@ def furnished_drone(
     T_room_w = np.eye(4)  # the drone's own world, fixed at power-on, in the room
     T_room_w[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     T_room_w[:3, 3] = start[0], start[1], low[2]
-    still = Site("room", seed, world, T_room_w, np.zeros(3), (), np.zeros((0, 2)))
+    still = Site("room", seed, world, T_room_w, np.zeros(3), ())
     return drone_at(still, tilt_rad, size, battery)
 
 

@@ -14,10 +14,11 @@ from edgeslam_torch.types import FloatArray
 Rng = np.random.Generator
 CLOSE_UPS = 0.35
 """Share of random poses that look at the top of a table or shelf from near."""
+TEXEL_M = 0.006
 WALLS = ("plaster", "plaster", "plaster", "rough_plaster", "wallpaper", "concrete", "bricks", "tiles", "veneer")
 
 
-def random_room(rng: Rng, *, texel_m: float = 0.006) -> World:
+def random_room(rng: Rng) -> World:
     """An indoor place of random size, layout, materials and light, for training depth."""
     if rng.random() < 0.12:
         length, width = rng.uniform(5.0, 12.0), rng.uniform(1.5, 2.8)
@@ -26,7 +27,7 @@ def random_room(rng: Rng, *, texel_m: float = 0.006) -> World:
         size = np.array([*np.exp(rng.uniform(np.log(2.3), np.log(8.5), 2)), rng.uniform(2.2, 3.4)])
         size[1] = min(size[1], 9.0)
     low, high = np.array([-size[0] / 2, -size[1] / 2, 0.0]), np.array([size[0] / 2, size[1] / 2, size[2]])
-    scene = shell(rng, low, high, texel_m, walls=WALLS)
+    scene = shell(rng, low, high, TEXEL_M, walls=WALLS)
     lamps_anywhere(scene, rng)
     scene.ambient = float(rng.uniform(0.35, 0.85))
     scene.exposure = float(np.exp(rng.normal(-0.05, 0.22)))

@@ -88,12 +88,12 @@ def named_site(name: str, seed: int) -> Site:
     T_site_w[:2, :2] = [[c, -s], [s, c]]
     T_site_w[:2, 3] = x, y
     T_w_site = se3.inverse(T_site_w)
-    path = se3.transform(T_w_site, np.array([[*xy, GOAL_HEIGHT_M] for xy in layout.way]))
+    goal = se3.transform(T_w_site, np.array([*layout.way[-1], GOAL_HEIGHT_M]))
     exits = tuple(
         TrueExit(T_w_site[:3, :3] @ e.centre_w + T_w_site[:3, 3], T_w_site[:3, :3] @ e.normal_w, e.width_m, e.height_m)
         for e in layout.exits
     )
-    return Site(file.name, seed, world, T_site_w, path[-1], exits, path[:, :2], tuple(layout.walkers))
+    return Site(file.name, seed, world, T_site_w, goal, exits, tuple(layout.walkers))
 
 
 def place(name: str, rng: Rng, **given: float) -> World:

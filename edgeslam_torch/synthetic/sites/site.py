@@ -34,8 +34,6 @@ class Site:
     """``(3,)`` where to go, in the drone's own world [m]."""
     exits: tuple[TrueExit, ...]
     """In the drone's own world."""
-    pathway_w: FloatArray
-    """``(N, 2)`` a polyline from the start to the goal through free space, in the drone's own world [m]."""
     walkers: tuple[Walker, ...] = ()
     """People, who are not in `world`."""
 

@@ -26,12 +26,13 @@ from edgeslam_torch.eval.judge.navigation.perception import (
     TruePerception,
     nothing_painted,
 )
-from edgeslam_torch.eval.judge.navigation.pictures import shortest_m
 from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.navigation.drone_state import DroneState
+from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.pilot import Phase
+from edgeslam_torch.navigation.pilot import BAND_M, Phase
+from edgeslam_torch.navigation.route import cost_to_go
 from edgeslam_torch.synthetic.sites.build import SITES, named_site
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
@@ -43,6 +44,8 @@ _SIGMAS, _NO_HARM_M = 3.0, 0.1
 """Bound of a consistent pose error: standard deviations, plus the hull's radius."""
 _FREE_M = 0.6
 """Clearance above which the cruising speed is measured."""
+_CELL_M = 0.1
+"""Of the true map."""
 
 
 def check(case: Case) -> None:
@@ -63,14 +66,14 @@ def run_flight(case: dict[str, Any], folder: Path) -> dict[str, Any]:
     return {"flown": fly(Case(**case["flight"])).record()}
 
 
-def fly(case: Case, limits: NavLimits | None = None) -> Flown:
+def fly(case: Case) -> Flown:
     """Fly one case in lockstep.
 
     Raises:
         EvaluationError: If the world, the fault or the behaviour is unknown.
     """
     check(case)
-    limits, conditions, behaviour = limits or NavLimits(), FAULTS[case.fault], BEHAVIOURS[case.behaviour]
+    limits, conditions, behaviour = NavLimits(), FAULTS[case.fault], BEHAVIOURS[case.behaviour]
     site, by_slam = named_site(case.world, case.seed), case.perception == "slam"
     wind = np.array([0.0, conditions.wind_m_s, 0.0])
     air = Air(wind, 0.5 * conditions.wind_m_s, np.random.default_rng([case.seed, 1]))
@@ -205,6 +208,29 @@ def _sum_up(found: Flown, site: Site, drone: DroneModel, ticks: list[_Tick], beh
     found.cruise_m_s = float(np.median(speed[moving])) if moving.any() else float("nan")
     found.clearance_p5_m, found.clearance_min_m = float(np.percentile(hull, 5)), float(hull.min())
     found.cpu_ms, found.cpu_worst_ms = float(np.median(cpu)), float(cpu.max())
+
+
+def true_layer(site: Site, limits: NavLimits) -> Layer:
+    """True layer at the flight height, in the drone's world."""
+    corners = np.array([[x, y, 0.0] for x in site.world.bounds_w[:, 0] for y in site.world.bounds_w[:, 1]])
+    local = (corners - site.T_site_w[:3, 3]) @ site.T_site_w[:3, :3]
+    low = np.floor(local[:, :2].min(0) / _CELL_M) * _CELL_M - _CELL_M
+    shape = np.ceil((local[:, :2].max(0) - low) / _CELL_M).astype(int) + 1
+    x, y = (low[k] + (np.arange(shape[k]) + 0.5) * _CELL_M for k in (0, 1))
+    grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    half = limits.radius_m + BAND_M
+    away = np.min([site.clearance(np.c_[grid, np.full(len(grid), limits.height_m + dz)]) for dz in (-half, 0, half)], 0)
+    solid = (away < 0.5 * _CELL_M).reshape(shape)
+    return Layer(~solid, solid, low, _CELL_M)
+
+
+def shortest_m(site: Site, limits: NavLimits) -> float:
+    """Length [m] of the shortest path from start to goal in the true map under the planner's limits; infinite if there
+    is none."""
+    layer, start = true_layer(site, limits), np.zeros(2)
+    plan = cost_to_go(layer, layer.cells(site.goal_w[None, :2]), limits.clearance_m(0.0), layer.cells(start))
+    way = plan.way(start, 100.0)
+    return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()) if np.isfinite(plan.at(start)) else float("inf")
 
 
 def _take_off_s(limits: NavLimits) -> float:

@@ -1,6 +1,5 @@
 """All judged flights: run in processes of their own, kept, and summed up in tables with confidence intervals."""
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,15 +10,11 @@ from edgeslam_torch.eval.experiment.conditions import code_state
 from edgeslam_torch.eval.experiment.runner import Local, Task, run_tasks
 from edgeslam_torch.eval.experiment.tables import markdown_table
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
-from edgeslam_torch.eval.judge.navigation.pictures import top_view
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.files.plain import write_image
 from edgeslam_torch.jobs.watched import Limits
 
 FAILED = "failed"
 """Prefix of the ending of a flight that raised an error."""
-_WORST = 6
-"""Number of worst flights with a top view."""
 _TIMEOUT_S = 3600.0
 HEAD = (
     "world", "behaviour", "fault", "perception", "flights", "reached", "contact", "no contact and landed on the floor",
@@ -33,7 +28,7 @@ EXITS_HEAD = ("behaviour", "perception", "exits there", "found", "precision", "r
 
 
 def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[str], None]) -> list[Flown]:
-    """Fly all cases, write a record each, ``navigation.md``, and top views of the worst.
+    """Fly all cases and write ``navigation.md``; the folder of each in ``flights`` has its record.
 
     Args:
         cases: Cases to fly.
@@ -60,14 +55,10 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
             flights[case] = Flown(case, ended=f"{FAILED}: {ended.reason if ended else ''}")
         else:
             flights[case] = Flown.of_record(found["flown"])
-            write_text(out / f"flight_{case.name}.json", json.dumps(found["flown"]) + "\n")
         if ended is not None:
             say(_line(flights[case]))
     done = [flights[case] for case in cases]
     write_text(out / "navigation.md", markdown(done))
-    seen = [flown for flown in done if flown.track_w]
-    for flown in sorted(seen, key=lambda f: (f.reached, not f.contacts, f.clearance_min_m))[:_WORST]:
-        write_image(out / f"top_{flown.case.name}.png", top_view(flown))
     return done
 
 

@@ -8,15 +8,9 @@ import pytest
 from markdown_rows import rows
 
 from edgeslam_torch.commands.judging import bench
-from edgeslam_torch.eval.benchmark.benchmark import (
-    BenchSettings,
-    figures_of,
-    markdown_bench,
-    markdown_compare,
-    read_record,
-    sequences,
-)
+from edgeslam_torch.eval.benchmark.benchmark import FIGURES, BenchSettings, figures_of, markdown_bench, sequences
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.experiment.figures import compared, read_record
 from edgeslam_torch.eval.metrics.run_score import evaluate_run
 
 
@@ -38,7 +32,8 @@ def test_table_lists_every_run_its_median_its_noise_and_the_peers():
 
 
 def test_comparison_names_other_conditions():
-    text = markdown_compare(record([0.01]), record([0.02], machine={"cpu": "other"}, max_frames=40))
+    others = record([0.02], machine={"cpu": "other"}, max_frames=40)
+    text = compared(record([0.01]), others, "runs", "sequence", FIGURES)
     assert "cpu was some, then other" in text and "max_frames was None, then 40" in text
     assert "worse: tum_fr1_xyz ATE Sim(3) [m] x2.00" in text
 
@@ -71,7 +66,7 @@ def test_other_files_are_no_records(text, tmp_path):
     if text is not None:
         path.write_text(text)
     with pytest.raises(EvaluationError, match="r.json"):
-        read_record(path)
+        read_record(path, "bench", (1, 2, 3), "runs")
 
 
 def run_bench(*words):
@@ -95,9 +90,9 @@ def test_synthetic_flight_is_run_once_and_judged(tmp_path, capsys, monkeypatch):
     words = ("--seeds", 1, "--max-frames", 40, "--out", tmp_path / "bench")
     assert run_bench(*words) == 0
     assert "edgeslam, seed 0" in capsys.readouterr().out
-    run = read_record(tmp_path / "bench" / "bench.json")["runs"][0]
+    (run,) = json.loads((tmp_path / "bench" / "bench.json").read_text())["runs"]
     assert run["figures"]["coverage"] > 0.5 and run["figures"]["cpu_orb"] > 0
     within = json.loads((tmp_path / "bench" / "synthetic_seed0" / "summary.json").read_text())["cpu_ms_per_frame"]
     assert run["figures"]["cpu_ms_per_frame"] > within  # start-up counts
     assert run_bench(*words) == 0
-    assert read_record(tmp_path / "bench" / "bench.json")["runs"] == [run]
+    assert json.loads((tmp_path / "bench" / "bench.json").read_text())["runs"] == [run]

@@ -8,9 +8,8 @@ from edgeslam_torch.cli import main
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.runner import Task
 from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, corridor_ends, right_exits
-from edgeslam_torch.eval.judge.navigation.flight import fly
+from edgeslam_torch.eval.judge.navigation.flight import fly, shortest_m, true_layer
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
-from edgeslam_torch.eval.judge.navigation.pictures import shortest_m, top_view, true_layer
 from edgeslam_torch.eval.judge.navigation.table import judge_flights, markdown
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
@@ -53,12 +52,6 @@ def test_flights_are_kept_and_one_that_fails_ends_no_other(tmp_path, monkeypatch
     assert flights[0].ended.startswith("failed: ") and "nowhere" in flights[0].ended
     assert len(said) == 1 and "nowhere" in said[0]
     assert row((tmp_path / "navigation.md").read_text(), "nowhere")["reached"].startswith("0 ")
-    assert [path.name for path in tmp_path.glob("flight_*.json")] == ["flight_blank_walls_0_none_truth.json"]
-
-
-def test_a_top_view_shows_the_way():
-    image = top_view(flown(True, track_w=[[0.0, 0.0, 1.0], [5.0, 0.0, 1.0]]))
-    assert image.ndim == 3 and (image == (200, 90, 20)).all(2).sum() > 300
 
 
 def test_unknown_faults_are_refused():

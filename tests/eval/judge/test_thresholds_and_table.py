@@ -4,8 +4,9 @@ import pytest
 from markdown_rows import row as cells_of
 
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.experiment.figures import compared
 from edgeslam_torch.eval.judge.score import COLUMNS
-from edgeslam_torch.eval.judge.table import markdown, markdown_against
+from edgeslam_torch.eval.judge.table import markdown
 from edgeslam_torch.eval.judge.thresholds import read_thresholds, verdicts_of_cell, verdicts_of_groups
 
 
@@ -94,7 +95,7 @@ def test_table_shows_medians_bars_and_failures(thresholds):
 def test_records_are_shown_side_by_side():
     before = record(row("desk", ate_m=0.01, losses=0.0), row("old", ate_m=0.1), commit="one")
     after = record(row("desk", ate_m=0.02, losses=0.0), row("new", ate_m=0.1), commit="two")
-    text = markdown_against(before, after)
+    text = compared(before, after, "rows", "cell", COLUMNS)
     assert "one -> two" in text
     assert cells_of(text, "desk")["ATE"] == "0.0100 -> 0.0200 x2.00 !"
     assert cells_of(text, "desk")["lost"] == "0 -> 0"
@@ -103,5 +104,6 @@ def test_records_are_shown_side_by_side():
 
 
 def test_cell_that_fails_now_counts_as_worse():
-    text = markdown_against(record(row("desk", ate_m=0.01)), record(row("desk", error="crashed")))
+    before, after = record(row("desk", ate_m=0.01)), record(row("desk", error="crashed"))
+    text = compared(before, after, "rows", "cell", COLUMNS)
     assert cells_of(text, "desk")["ATE"] == "0.0100 -> - !"

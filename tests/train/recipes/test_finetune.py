@@ -174,6 +174,8 @@ def test_more_steps_go_on_and_fewer_are_refused(finetune, trained, tmp_path):
     curve = [json.loads(line)["step"] for line in (tmp_path / "out" / "curve.jsonl").read_text().splitlines()]
     assert curve == [*range(9), *range(9, 13)]
     refused(finetune("kitchen", steps=6), "has 12 steps behind it, so it cannot end after 6")
+    sessions = json.loads((tmp_path / "out" / "finetune.json").read_text())["sessions"]
+    assert [(s["from_step"], s["steps"]) for s in sessions] == [(0, 8), (8, 12)]
 
 
 @pytest.mark.slow

@@ -54,7 +54,7 @@ def test_a_place_depends_on_its_number_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(rendered_views, "WIDTH", 64)
     monkeypatch.setattr(rendered_views, "HEIGHT", 48)
     for name, count in (("one", 1), ("two", 2)):
-        rendered_views._render_file((tmp_path / name, rendered_views.place_views, range(count), 21))
+        rendered_views._render_file(tmp_path / name, rendered_views.place_views, range(count), 21)
     with np.load(tmp_path / "one") as one, np.load(tmp_path / "two") as two:
         assert 0 < len(one["image"]) < len(two["image"])
         for name in ("image", "depth", "K"):
