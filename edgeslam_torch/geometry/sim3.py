@@ -77,26 +77,6 @@ def log(S: FloatArray) -> FloatArray:
     return np.concatenate([rho, phi, sigma[..., None]], axis=-1)
 
 
-def fit(a: FloatArray, b: FloatArray) -> FloatArray | None:
-    """Similarity that takes points ``a`` to ``b``, ``(N, 3)`` each, with the least squared distance.
-
-    Umeyama, PAMI 1991. None for fewer than three points or collinear ones, which leave a rotation undetermined.
-    """
-    if len(a) < 3:
-        return None
-    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
-    spread = float(((a - mean_a) ** 2).sum()) / len(a)
-    U, d, V_t = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
-    if spread < 1e-18 or d[1] < 1e-9 * d[0]:
-        return None
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(V_t))])
-    scale = float((d * sign).sum()) / spread
-    if not scale > 0:
-        return None
-    R = (U * sign) @ V_t
-    return compose(scale, R, mean_b - scale * R @ mean_a)
-
-
 def _left(phi: FloatArray, sigma: FloatArray) -> FloatArray:
     """Integral of ``exp(u (sigma + hat(phi)))`` over ``u`` from 0 to 1, ``(..., 3, 3)``: maps rho to t."""
     theta, scale = np.linalg.norm(phi, axis=-1), np.exp(sigma)

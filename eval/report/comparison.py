@@ -12,11 +12,11 @@ import numpy as np
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import match
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, open_run
+from edgeslam_torch.eval.metrics.align import Alignment, umeyama
 from edgeslam_torch.eval.metrics.run_score import RunScore
 from edgeslam_torch.eval.report import line_drawings, words
 from edgeslam_torch.eval.report.page import TEMPLATE, judge_run, upright
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.geometry import sim3
 from edgeslam_torch.types import FloatArray
 
 COLOURS = ("var(--tracked)", "var(--predicted)")
@@ -123,16 +123,19 @@ def _paths(sides: Sequence[_Side]) -> str:
     there, moving = sides[still], sides[1 - still]
     stamps, unit = there.run.trajectory.stamps_s, words.unit(there.run)
     i, j = match(stamps, moving.run.trajectory.stamps_s)
-    S = sim3.fit(moving.positions[j], there.positions[i]) if len(i) >= _MIN_COMMON else None
-    if S is None:
+    try:
+        found = umeyama(moving.positions[j], there.positions[i])
+    except EvaluationError:
+        found = Alignment(degenerate=True)
+    if len(i) < _MIN_COMMON or found.degenerate or not found.scale > 0:
         note = "The runs have no frames in common (or stood still), so each path is drawn in its own world."
         drawn = "".join(_views([side.positions], [COLOURS[k]], words.unit(side.run)) for k, side in enumerate(sides))
         return f'<p class="note">{note}</p>{drawn}'
-    moved = sim3.transform(S, moving.positions)
+    moved = found.points(moving.positions)
     apart = np.linalg.norm(moved[j] - there.positions[i], axis=1)
     note = (
         f"{_LETTERS[1 - still]} is aligned to {_LETTERS[still]} by {len(i)} common frames (rotated, translated, scaled "
-        f"by {sim3.scale_of(S):.4g}); the remaining distance is {float(np.sqrt(np.mean(apart**2))):.3g} {unit} RMS, "
+        f"by {found.scale:.4g}); the remaining distance is {float(np.sqrt(np.mean(apart**2))):.3g} {unit} RMS, "
         f"{float(apart.max()):.3g} {unit} at most."
     )
     chart = line_drawings.chart(stamps[i] - stamps[0], apart, "var(--accent)", f"apart [{unit}]")

@@ -1,7 +1,5 @@
 """Similarities: exponential and logarithm, groups' laws, least squares."""
 
-import math
-
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -40,23 +38,3 @@ def test_camera_of_a_moved_world_sees_the_same_pixels(rng):
     before = se3.transform(T_c_w, p)
     after = se3.transform(sim3.moved_camera(S, T_c_w), sim3.transform(S, p))
     np.testing.assert_allclose(after, sim3.scale_of(S) * before, atol=1e-9)
-
-
-def test_fit_finds_the_similarity_that_made_the_points(rng):
-    S = sim3.exp(rng.normal(size=7))
-    a = rng.normal(size=(10, 3))
-    np.testing.assert_allclose(sim3.fit(a, sim3.transform(S, a)), S, atol=1e-9)
-    assert sim3.fit(a[:2], a[:2]) is None
-    on_a_line = np.outer(np.arange(5.0), [1.0, 2.0, 3.0])
-    assert sim3.fit(on_a_line, on_a_line) is None
-
-
-def test_fit_by_hand():
-    """Half a turn about z, twice the size, one to the right."""
-    a = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-    b = np.array([[-1.0, 0, 0], [1, -2, 0], [3, 0, 0], [1, 0, 2]])
-    scale, R, t = sim3.parts(sim3.fit(a, b))
-    assert scale == pytest.approx(2.0)
-    np.testing.assert_allclose(R, np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
-    np.testing.assert_allclose(t, [1.0, 0, 0], atol=1e-12)
-    assert math.isclose(sim3.scale_of(sim3.fit(a, b)), 2.0)
