@@ -149,7 +149,7 @@ class OutFolder:
             strange = next((name for name in FILES if (self.path / name).exists()), None)
             if strange is not None:
                 raise OutputError(
-                    f"{self.path}: holds {strange}, but no {RECORD} that says where it is from; give another --out"
+                    f"{self.path}: holds {strange}, but no {RECORD} that states its origin; give another --out"
                 )
             check_free(self.path, ())
             if self.existing is Existing.RESUME:
@@ -158,11 +158,11 @@ class OutFolder:
         if self.existing is Existing.OVERWRITE or not (step := self.step):
             return
         if step > given["steps"]:
-            raise ConfigError(f"{self.path}: has {step} steps behind it, so it cannot end after {given['steps']}")
+            raise ConfigError(f"{self.path}: has {step} steps already, so it cannot end after {given['steps']}")
         resumed = self.existing is Existing.RESUME
         if different := differences(record["given"], given, WITH_RESUME if resumed else NOT_COMPARED):
             only_rate = not differences(record["given"], given, WITH_RESUME)
-            way_out = "--resume to go on like this" if only_rate else "--overwrite to replace it"
+            way_out = "--resume to continue with it" if only_rate else "--overwrite to replace it"
             raise ConfigError(
                 f"{self.path}: holds another fine-tuning ({'; '.join(different)}); give another --out, or {way_out}"
             )

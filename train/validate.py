@@ -94,7 +94,8 @@ def score(network: DepthModule, metadata: Metadata, views: Sequence[View]) -> De
         raise SourceError(f"no depth between {MIN_DEPTH_M:g} and {MAX_DEPTH_M:g} m in any image to validate on")
     *columns, log_scale = np.array(rows).T
     known = [column[~np.isnan(column)] for column in columns]  # images without edges have no error there
-    return DepthScores(*(float(c.mean()) if len(c) else float("nan") for c in known), float(np.std(log_scale)))
+    means = [float(column.mean()) if len(column) else float("nan") for column in known]
+    return DepthScores(*[*means, float(np.std(log_scale))])
 
 
 def can_be_scored(view: View) -> bool:

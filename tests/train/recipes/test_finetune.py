@@ -153,7 +153,7 @@ def test_moved_data_and_folder_go_on(finetune, recordings, tmp_path):
     shutil.move(tmp_path / "first", tmp_path / "second")
     code, stdout, _ = finetune(str(tmp_path / "there" / "kitchen"), out=tmp_path / "second", steps=10)
     assert code == 0
-    assert "goes on after step 8" in stdout
+    assert "resumes after step 8" in stdout
 
 
 def test_same_command_again_trains_nothing_and_says_so(finetune, eight_steps, trained, tmp_path):
@@ -169,11 +169,11 @@ def test_same_command_again_trains_nothing_and_says_so(finetune, eight_steps, tr
 def test_more_steps_go_on_and_fewer_are_refused(finetune, trained, tmp_path):
     code, stdout, _ = finetune("kitchen", steps=12)
     assert code == 0
-    assert "goes on after step 8" in stdout
+    assert "resumes after step 8" in stdout
     assert saved_step(tmp_path / "out" / "last.pt") == 12
     curve = [json.loads(line)["step"] for line in (tmp_path / "out" / "curve.jsonl").read_text().splitlines()]
     assert curve == [*range(9), *range(9, 13)]
-    refused(finetune("kitchen", steps=6), "has 12 steps behind it, so it cannot end after 6")
+    refused(finetune("kitchen", steps=6), "has 12 steps already, so it cannot end after 6")
     sessions = json.loads((tmp_path / "out" / "finetune.json").read_text())["sessions"]
     assert [(s["from_step"], s["steps"]) for s in sessions] == [(0, 8), (8, 12)]
 
@@ -297,9 +297,9 @@ def test_signal_says_what_is_kept_and_the_same_command_goes_on(finetune, eight_s
         code, _, stderr = finetune("kitchen")
     assert code == 130
     assert signal.getsignal(number) is before
-    assert stderr.splitlines()[-1].endswith("holds step 5, and the same command goes on from there")
+    assert stderr.splitlines()[-1].endswith("holds step 5, and the same command resumes from there")
     whole, resumed = eight_steps[0], tmp_path / "out"
-    assert "goes on after step 5" in finetune("kitchen")[1]
+    assert "resumes after step 5" in finetune("kitchen")[1]
     for name in ("weights.safetensors", "final.safetensors", "curve.jsonl"):
         assert (whole / name).read_bytes() == (resumed / name).read_bytes(), name
 
