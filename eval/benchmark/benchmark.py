@@ -55,6 +55,11 @@ FIGURES = (
     Figure("fps", "frames/s", "{:.1f}"),
     Figure("peak_rss_mb", "memory [MB]", "{:.0f}", floor=0.05),
 )
+_OF_SCORE = (
+    *("ate_sim3_m", "ate_online_sim3_m", "coverage", "first_pose_s"),
+    *("rotation_deg", "rpe_1s_m", "full_transform"),
+)
+"""Figures with the names of a `RunScore`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,17 +205,11 @@ def run_sequence(case: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 def figures_of(score: RunScore) -> dict[str, float | None]:
     """The benchmark's figures of one judged run."""
-    summary = score.summary
+    summary, is_metric = score.summary, score.units == "metres"
     own: dict[str, float | None] = {
-        "ate_sim3_m": score.ate_sim3_m,
-        "ate_online_sim3_m": score.ate_online_sim3_m,
-        "ate_se3_m": score.ate_se3_m if score.units == "metres" else None,
-        "scale_error_abs": abs(score.scale_error) if score.units == "metres" else None,
-        "coverage": score.coverage,
-        "first_pose_s": score.first_pose_s,
-        "rotation_deg": score.rotation_deg,
-        "rpe_1s_m": score.rpe_1s_m,
-        "full_transform": score.full_transform,
+        **{name: getattr(score, name) for name in _OF_SCORE},
+        "ate_se3_m": score.ate_se3_m if is_metric else None,
+        "scale_error_abs": abs(score.scale_error) if is_metric else None,
         **{name: summary.get(name) for name in ("fps", "cpu_ms_per_frame", "peak_rss_mb", "dropped_frames")},
         "finish_ms": 1e3 * summary["finish_s"] if "finish_s" in summary else None,
     }

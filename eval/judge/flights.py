@@ -1,16 +1,17 @@
-"""``python -m edgeslam_torch.eval.judge.flights COURSE SEED FOLDER FLIGHT``: record a simulated flight, once for all
-judges; a process of its own, so that drawing the pictures does not count as the judged run's memory."""
+"""Simulated flights of the judge, each recorded once for all judges, and sources without usable images."""
 
 import hashlib
-import subprocess
-import sys
 import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import lru_cache
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 
 from edgeslam_torch import synthetic
+from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.judge.sources import made_of
 from edgeslam_torch.readers.source import Recording
@@ -43,11 +44,12 @@ def flight_folder(root: Path, course: str, seed: int, flight: int = 0) -> Path:
     """
     folder = root / f"{course}-s{seed}{f'-f{flight}' if flight else ''}-{_simulator()}"
     if not folder.is_dir():
-        words = [course, str(seed), str(folder), str(flight)]
-        command = [sys.executable, "-m", "edgeslam_torch.eval.judge.flights", *words]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            raise EvaluationError(f"{course}, seed {seed}: could not be recorded: {done.stderr.strip()[-300:]}")
+        # In a process of its own: drawing the pictures does not count as the judged run's memory.
+        with ProcessPoolExecutor(1, get_context("spawn")) as other:
+            try:
+                other.submit(record_once, folder, course, seed, flight).result()
+            except (EdgeSlamError, OSError, BrokenProcessPool) as error:
+                raise EvaluationError(f"{course}, seed {seed}: could not be recorded: {error}") from error
     return folder
 
 
@@ -87,7 +89,7 @@ def _record_again(folder: Path, name: str, seed: int, flight: int) -> None:
     record_flight(folder, world, flown_again, rng, camera, course.telemetry, course.faults, seed=seed + flight)
 
 
-def main(course: str, seed: int, folder: Path, flight: int = 0) -> int:
+def record_once(folder: Path, course: str, seed: int, flight: int = 0) -> None:
     """Record into a temporary folder and rename it to ``folder`` when complete; the first of several processes wins."""
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as own:
         part = Path(own) / folder.name
@@ -100,8 +102,3 @@ def main(course: str, seed: int, folder: Path, flight: int = 0) -> int:
         except OSError:
             if not folder.is_dir():  # not another judge's
                 raise
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4])))

@@ -138,14 +138,18 @@ def _open_view(world: World, p_w: FloatArray, yaw: float, view_m: float) -> floa
     reach = np.linspace(0.4, view_m, 8)
     best, best_free = yaw, -1
     for turn in np.deg2rad([0, 25, -25, 50, -50, 75, -75, 105, -105, 140, -140, 180]):
-        ray = p_w + reach[:, None] * np.array([np.cos(yaw + turn), np.sin(yaw + turn), 0.0])
-        blocked = np.flatnonzero(world.clearance(ray) < 0.1)
-        free = int(blocked[0]) if len(blocked) else len(reach)
+        free = _free_steps(world, p_w, yaw + turn, reach, 0.1)
         if free > best_free:
             best, best_free = yaw + float(turn), free
         if free == len(reach):
             break
     return best
+
+
+def _free_steps(world: World, p_w: FloatArray, yaw: float, reach: FloatArray, least_m: float) -> int:
+    """Distances ``reach`` [m] in a direction up to the first that is nearer than ``least_m`` to something."""
+    ray = p_w + reach[:, None] * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    return int(np.append(world.clearance(ray) < least_m, True).argmax())
 
 
 def _wrapped(angle: float) -> float:
@@ -172,9 +176,7 @@ def _open_direction(rng: Rng, world: World, p_w: FloatArray) -> float:
     reach = np.arange(0.3, 8.0, 0.3)
     best, best_free = 0.0, -1
     for yaw in yaws:
-        ray = p_w + reach[:, None] * np.array([np.cos(yaw), np.sin(yaw), 0.0])
-        blocked = np.flatnonzero(world.clearance(ray) < 0.3)
-        free = int(blocked[0]) if len(blocked) else len(reach)
+        free = _free_steps(world, p_w, yaw, reach, 0.3)
         if free > best_free:
             best, best_free = float(yaw), free
     return best

@@ -77,7 +77,7 @@ GOOD = ["0.0 0 0 0 0 0 0 1", "0.1 1 0 0 0 0 0 1", "0.2 2 0 0 0 0 0 1"]
         (["time x y theta", "0.0 0 0 0", "1.0 0 0 0"], "no column for z"),
         (["t [h],x,y,z", *(f"{t},0,0,0" for t in range(4))], "not known: s, ms"),
         ([f"1.7e+09 {k} 0 0 0 0 0 1" for k in range(9)], "too few digits"),
-        (["0.0 1 2 3 10 20 30 40", "0.1 1 2 3 10 20 30 40"], "no unit quaternion"),
+        (["0.0 1 2 3 10 20 30 40", "0.1 1 2 3 10 20 30 40"], "unit quaternion"),
         ([*GOOD, "0.3 1 2"], "line 4 has 3 columns"),
         ([*GOOD, "0.3 one 0 0 0 0 0 1"], "line 4, column 2 is not a number"),
     ],

@@ -82,7 +82,7 @@ def test_a_corridor_ends_at_its_door_or_in_its_arm():
     assert door == pytest.approx(named_site("corridor", 0).exits[0].centre_w[:2])
     left, right = corridor_ends(named_site("t_corridor", 0))
     assert left[0] == right[0] and left[1] == -right[1] != 0
-    with pytest.raises(ValueError, match="no corridor"):
+    with pytest.raises(ValueError, match="two_rooms"):
         corridor_ends(named_site("two_rooms", 0))
 
 

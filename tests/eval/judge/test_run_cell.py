@@ -1,9 +1,7 @@
 """A cell from recording to figures, on a tiny rendered flight."""
 
 import shutil
-import subprocess
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -177,7 +175,7 @@ def test_second_flight_is_in_the_map_of_the_first_and_judged_against_it(recordin
 
 def test_a_further_flight_has_another_path_through_the_same_world(tmp_path, monkeypatch):
     monkeypatch.setitem(COURSES, "corridor", replace(COURSES["corridor"], seconds=0.2))
-    assert flights.main("corridor", 3, tmp_path / "again", 1) == 0
+    flights.record_once(tmp_path / "again", "corridor", 3, 1)
     world, first, _ = flights.flown(COURSES["corridor"], 3, seconds=0.4)
     again = open_dataset(tmp_path / "again").truth
     assert len(again.stamps_s) == 4
@@ -188,30 +186,10 @@ def test_a_further_flight_has_another_path_through_the_same_world(tmp_path, monk
 @pytest.mark.slow
 def test_a_further_flight_through_the_building_takes_off_from_the_same_place(tmp_path, monkeypatch):
     monkeypatch.setitem(COURSES, "building", replace(COURSES["building"], seconds=6.0, rate_hz=2.0))
-    assert flights.main("building", 0, tmp_path / "again", 1) == 0
+    flights.record_once(tmp_path / "again", "building", 0, 1)
     first = flights.flown(COURSES["building"], 0)[1].T_w_c[:, :3, 3]
     apart = np.linalg.norm(open_dataset(tmp_path / "again").truth.positions - first, axis=1)
     assert apart[0] < 0.05 and apart.max() > 0.1
-
-
-def test_flight_is_recorded_once_and_only_whole(tmp_path, monkeypatch):
-    calls = []
-    monkeypatch.setattr(flights, "record_course", lambda part, course, seed: (part.mkdir(), calls.append(seed)))
-    monkeypatch.setattr(flights.subprocess, "run", lambda command, **_: finished(flights.main(*plain(command))))
-    first = flights.flight_folder(tmp_path, "room", 2)
-    assert flights.flight_folder(tmp_path, "room", 2) == first and first.is_dir() and calls == [2]
-    monkeypatch.setattr(flights.subprocess, "run", lambda *_, **__: finished(1, "no space left"))
-    with pytest.raises(EvaluationError, match="room, seed 3: could not be recorded: no space left"):
-        flights.flight_folder(tmp_path, "room", 3)
-
-
-def plain(command):
-    """Arguments of ``flights.main`` in its command line."""
-    return command[-4], int(command[-3]), Path(command[-2]), int(command[-1])
-
-
-def finished(code, stderr=""):
-    return subprocess.CompletedProcess([], code, "", stderr)
 
 
 def test_recordings_with_truth_are_found_and_short_variants_left_out(recording):

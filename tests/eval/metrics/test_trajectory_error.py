@@ -119,7 +119,7 @@ def assert_agrees(truth, estimate, kind):
 
 @pytest.mark.parametrize("kind", list(AlignmentKind))
 def test_agrees_with_evo_on_random_trajectories(kind, rng):
-    for _ in range(67):  # three alignments: 201 trajectories
+    for _ in range(25):
         assert_agrees(*random_pair(rng), kind)
 
 
