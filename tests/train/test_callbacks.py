@@ -3,24 +3,15 @@
 from collections import Counter
 from dataclasses import replace
 
-import numpy as np
 import pytest
-from small_depth import METADATA, small_depth
+from small_depth import METADATA, VIEW, learn
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.summary.writer import event_file_writer
 
 from edgeslam_torch.train.callbacks import ProgressBar, TensorBoard
 from edgeslam_torch.train.hooks import Hooks
-from edgeslam_torch.train.loop import train
-from edgeslam_torch.train.signals import Source, Supervised
 from edgeslam_torch.train.state import TrainConfig
-from edgeslam_torch.train.views.augment import View
 
-VIEW = View(
-    np.full((32, 64, 3), 90, np.uint8),
-    np.full((32, 64), 2.0, np.float32),
-    np.array([[50.0, 0, 31.5], [0, 50.0, 15.5], [0, 0, 1]]),
-)
 CONFIG = TrainConfig(steps=9, batch=1, warmup_steps=1, validate_every=3, checkpoint_every=4)
 
 
@@ -37,9 +28,7 @@ class _Killed(Hooks):
 
 
 def run(out, config, *more):
-    hooks = [ProgressBar(), TensorBoard(out / "tensorboard", METADATA, [VIEW]), *more]
-    signal = Supervised([Source("made", [VIEW], 1.0)], METADATA)
-    return train(small_depth(), METADATA, [signal], config, out, lambda n: {"score": 1.0}, hooks)
+    return learn(out, config, [ProgressBar(), TensorBoard(out / "tensorboard", METADATA, [VIEW]), *more])
 
 
 def test_steps_are_in_tensorboard_once_after_interrupts_and_more_steps(tmp_path, monkeypatch):

@@ -3,38 +3,27 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from small_depth import METADATA, small_depth
+from small_depth import METADATA, VIEW, learn, small_depth
 
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.train import (
     Data,
     DepthFolder,
     Hooks,
-    Source,
-    Supervised,
     TrainConfig,
-    View,
     finetune,
     named_hooks,
     out_folder,
-    train,
 )
 
-VIEW = View(
-    np.full((32, 64, 3), 90, np.uint8),
-    np.full((32, 64), 2.0, np.float32),
-    np.array([[50.0, 0, 31.5], [0, 50.0, 15.5], [0, 0, 1]]),
-)
 CONFIG = TrainConfig(steps=4, batch=2, warmup_steps=1, validate_every=2, checkpoint_every=2, freeze_norm=True)
 EXAMPLES = Path(__file__).parents[2] / "examples" / "training_hooks.py"
 
 
 def run(out, *hooks, config=CONFIG):
-    signal = Supervised([Source("made", [VIEW], 1.0)], METADATA)
-    return train(small_depth(), METADATA, [signal], config, out, lambda n: {"score": 1.0, "abs_rel": 0.3}, hooks)
+    return learn(out, config, hooks)
 
 
 class Diary(Hooks):

@@ -7,14 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 from posed_run import CAMERA
+from small_depth import RUNS, narrow_fastdepth
 
-from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
-from edgeslam_torch.models.fastdepth import Widths
-from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
 from edgeslam_torch.train import load_run
 
 SCRIPT = Path(__file__).parents[2] / "examples" / "own_training_loop.py"
-METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +26,7 @@ def example():
 
 def test_pairs_show_the_points_where_they_are(example, run_folder):
     run = load_run(run_folder)
-    pairs = example.Pairs(run, METADATA)
+    pairs = example.Pairs(run, RUNS)
     assert len(pairs) == len(run.usable)
     sample = pairs[0]
     assert sample["image_i"].shape == sample["image_j"].shape == (3, 96, 128)
@@ -40,9 +38,8 @@ def test_pairs_show_the_points_where_they_are(example, run_folder):
 
 
 def test_loop_trains_and_writes_weights(example, run_folder, tmp_path, monkeypatch, capsys):
-    torch.manual_seed(0)
-    network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
-    save_checkpoint(network, METADATA, tmp_path / "start.safetensors")
+    network = narrow_fastdepth()
+    save_checkpoint(network, RUNS, tmp_path / "start.safetensors")
     words = [
         str(run_folder),
         "--out",

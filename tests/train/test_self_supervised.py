@@ -10,21 +10,19 @@ import numpy as np
 import pytest
 import torch
 from posed_run import CAMERA, FRAMES, world
+from small_depth import RUNS, narrow_fastdepth
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.models.checkpoint import build_network
-from edgeslam_torch.models.fastdepth import Prediction, Widths
-from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.fastdepth import Prediction
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.train.self_supervised import SelfSupervised
 from edgeslam_torch.train.signals import Slot
+from edgeslam_torch.train.teachers import teach as teacher
 from edgeslam_torch.train.teachers.teach import log_metres, teach
 from edgeslam_torch.train.validate import metres_by
 from edgeslam_torch.train.views.junctions import junction_points, seen_cosines
 from edgeslam_torch.train.views.posed import is_run_folder, load_run, visible_points
 from edgeslam_torch.train.views.straight import straight_edges
-
-METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +96,7 @@ def never_flipped():
 
 
 def test_every_term_is_smallest_at_the_true_depth(sequence):
-    signal = SelfSupervised([sequence], METADATA, zoom=(1.0, 1.0))
+    signal = SelfSupervised([sequence], RUNS, zoom=(1.0, 1.0))
     slots = [Slot(0, 0, k) for k in range(2)]
     with never_flipped():
         batch, _ = signal.draw(slots)
@@ -113,7 +111,7 @@ def test_every_term_is_smallest_at_the_true_depth(sequence):
 def test_what_is_drawn_is_the_run_in_metres(sequence, k):
     """Brought to metres, baselines and depths are twice as long; points lie where the zoom puts them."""
     slot = Slot(3, 0, k)
-    batches = [SelfSupervised([sequence], METADATA, log_scale=[s]).draw([slot])[0] for s in (0.0, float(np.log(2.0)))]
+    batches = [SelfSupervised([sequence], RUNS, log_scale=[s]).draw([slot])[0] for s in (0.0, float(np.log(2.0)))]
     units, metres = ({name: value[0].double() for name, value in b.items() if name != "image"} for b in batches)
     known = units["known"].bool()
     torch.testing.assert_close(metres["T_j_i"][:, :3, 3], 2.0 * units["T_j_i"][:, :3, 3])
@@ -133,7 +131,7 @@ def test_what_is_drawn_is_the_run_in_metres(sequence, k):
 
 
 def test_batch_follows_the_slot_alone(sequence):
-    signal = SelfSupervised([sequence], METADATA)
+    signal = SelfSupervised([sequence], RUNS)
     both, names = signal.draw([Slot(1, 7, 0), Slot(1, 7, 1)])
     second, name = signal.draw([Slot(1, 7, 1)])
     assert torch.equal(both["rgb_i"][1:], second["rgb_i"])
@@ -145,7 +143,7 @@ def test_flipped_pairs_keep_their_geometry(sequence):
     """Map points of view i move to the same colours in view j, mirrored or not."""
     from edgeslam_torch.losses.base import back_project, move, project
 
-    signal = SelfSupervised([sequence], METADATA)
+    signal = SelfSupervised([sequence], RUNS)
     errors = []
     for k in range(8):
         b, _ = signal.draw([Slot(3, k, 0)])
@@ -165,9 +163,8 @@ def sample(image, uv):
 
 
 def test_gradient_reaches_the_network(sequence):
-    torch.manual_seed(0)
-    network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
-    signal = SelfSupervised([sequence], METADATA)
+    network = narrow_fastdepth()
+    signal = SelfSupervised([sequence], RUNS)
     batch, _ = signal.draw([Slot(0, 0, 0)])
     losses = signal.losses(network.predict(batch["image"]), batch)
     assert set(losses) == {"photometric", "points", "cycle", "lshape", "smooth", "uncertainty"}
@@ -214,12 +211,13 @@ def test_junctions_of_two_views_are_paired_by_place_and_direction():
     assert seen_cosines(turned, found).isnan().all(), "arms the other way"
 
 
-def test_teacher_measures_what_the_network_does_not_know(sequence, tmp_path):
-    torch.manual_seed(0)
-    network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
+@pytest.mark.parametrize("width", [240, 100], ids=["as they are", "reduced"])
+def test_teacher_measures_what_the_network_does_not_know(sequence, tmp_path, monkeypatch, width):
+    monkeypatch.setattr(teacher, "WIDTH", width)
+    network = narrow_fastdepth()
     metres = 0.5
     errors, shares = [], []
-    dense = teach(metres_by(network, METADATA), sequence, float(np.log(metres)), tmp_path)
+    dense = teach(metres_by(network, RUNS), sequence, float(np.log(metres)), tmp_path)
     for view, taught in zip(sequence.views, dense, strict=True):
         error = np.abs(taught.view.depth_m / (metres * render(world(), CAMERA, view.T_w_c).depth_m) - 1)
         errors.append(np.median(error))

@@ -9,15 +9,13 @@ import time
 
 import pytest
 import torch
+from small_depth import RUNS, narrow_fastdepth
 
-from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
-from edgeslam_torch.models.fastdepth import Widths
-from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
 from edgeslam_torch.train.state import saved_step
 
 pytestmark = pytest.mark.slow
 
-METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
 TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
 MODULE = ("-m", "edgeslam_torch.cli")
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
@@ -25,8 +23,7 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_TH
 
 @pytest.fixture
 def weights(tmp_path):
-    torch.manual_seed(0)
-    save_checkpoint(build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5)), METADATA, tmp_path / "w.safetensors")
+    save_checkpoint(narrow_fastdepth(), RUNS, tmp_path / "w.safetensors")
     return tmp_path / "w.safetensors"
 
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import torch
 from depth_folder import write_folder
+from small_depth import narrow_fastdepth
 
 from edgeslam_torch import cli
-from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
-from edgeslam_torch.models.fastdepth import Widths
+from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import loop
 from edgeslam_torch.train.callbacks import ProgressBar
@@ -38,8 +38,7 @@ def recordings(tmp_path_factory):
     root = tmp_path_factory.mktemp("recordings")
     write_folder(root / "kitchen")
     write_folder(root / "hall", 8)
-    torch.manual_seed(0)
-    network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
+    network = narrow_fastdepth(METADATA)
     save_checkpoint(network, METADATA, root / "start.safetensors")
     return root
 
@@ -125,8 +124,7 @@ def test_other_data_into_the_same_folder_is_refused_and_nothing_changes(finetune
 
 
 def test_other_weights_are_refused(finetune, trained, tmp_path):
-    torch.manual_seed(1)
-    network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
+    network = narrow_fastdepth(METADATA, seed=1)
     save_checkpoint(network, METADATA, tmp_path / "other.safetensors")
     refused(finetune("kitchen", "--weights", str(tmp_path / "other.safetensors")), "weights: ")
     own = tmp_path / "out" / "weights.safetensors"

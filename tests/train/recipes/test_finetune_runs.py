@@ -8,31 +8,22 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-import torch
+from small_depth import RUNS, narrow_fastdepth
 
 from edgeslam_torch.commands.training import finetune as command
 from edgeslam_torch.commands.training._inputs import EXIT_INTERRUPTED
 from edgeslam_torch.errors import OutputError, SourceError
-from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
-from edgeslam_torch.models.fastdepth import Widths
-from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
 from edgeslam_torch.train.recipes.finetune import Data
 from edgeslam_torch.train.teachers import teach as teacher
 from edgeslam_torch.train.views import posed, slam_runs
 from edgeslam_torch.train.views.posed import load_run
 from edgeslam_torch.train.views.slam_runs import ensure_run
 
-METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
-
-
-def network():
-    torch.manual_seed(0)
-    return build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
-
 
 def arguments(tmp_path, *words):
     if not (tmp_path / "start.safetensors").exists():
-        save_checkpoint(network(), METADATA, tmp_path / "start.safetensors")
+        save_checkpoint(narrow_fastdepth(), RUNS, tmp_path / "start.safetensors")
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)
     fixed = ("--out", tmp_path / "out", "--weights", tmp_path / "start.safetensors", "--steps", "3", "--batch", "2")
@@ -133,7 +124,7 @@ def test_depth_in_the_cache_is_measured_once_for_two_trainings(run_folder, tmp_p
         patch.setattr(teacher, "_sweep", None)
         patch.setattr(teacher, "_completed", None)
         assert command.main(arguments(tmp_path, run_folder, *cached, "--lr", "1e-4", "--out", tmp_path / "other")) == 0
-    save_checkpoint(network(), replace(METADATA, focal_px=110.0), tmp_path / "other.safetensors")
+    save_checkpoint(narrow_fastdepth(), replace(RUNS, focal_px=110.0), tmp_path / "other.safetensors")
     words = (*cached, "--out", tmp_path / "third", "--weights", tmp_path / "other.safetensors")
     assert command.main(arguments(tmp_path, run_folder, *words)) == 0
     assert len(list((tmp_path / "cache").iterdir())) == 2

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from small_depth import narrow_fastdepth
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.checkpoint import build_network
@@ -12,9 +13,8 @@ from edgeslam_torch.train.recipes.weights import mean_of
 
 def test_the_mean_lies_between_and_is_of_one_network():
     metadata = Metadata(input_height=32, input_width=64, focal_px=60.0)
-    small, other = Widths((4,) + (8,) * 13, (8,) * 5), Widths((4,) + (8,) * 13, (8,) * 4 + (4,))
-    torch.manual_seed(0)
-    a, b = (build_network(metadata, small) for _ in range(2))
+    other = Widths((4,) + (8,) * 13, (8,) * 4 + (4,))
+    a, b = (narrow_fastdepth(metadata, seed) for seed in range(2))
     state = mean_of(a, b, 0.25)
     for name, x in a.state_dict().items():
         y = b.state_dict()[name]

@@ -1,0 +1,28 @@
+"""Scores of a network that is wrong by a known factor."""
+
+import numpy as np
+import pytest
+import torch
+from small_depth import METADATA, VIEW, small_depth
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.models.trainable import Prediction
+from edgeslam_torch.train.validate import score
+from edgeslam_torch.train.views.augment import View
+
+
+def two_metres(x):
+    return Prediction(torch.full((len(x), 1, *x.shape[-2:]), float(np.log(2.0))), None)
+
+
+def test_depth_out_of_range_does_not_count():
+    network = small_depth()
+    network.predict = two_metres
+    depth = np.full((32, 64), 2.5, np.float32)
+    depth[:8], depth[8:16] = 0.05, 12.0
+    found = score(network, METADATA, [View(VIEW.image, depth, VIEW.K)])
+    assert (found.abs_rel, found.rmse_m) == pytest.approx((0.2, 0.5), abs=1e-5)
+    assert found.abs_rel_scaled == pytest.approx(0.0, abs=1e-5) and found.delta1_scaled == 1.0
+    assert np.isnan(found.abs_rel_edges) and "abs_rel_edges" not in found.metrics()
+    with pytest.raises(SourceError, match="no depth between"):
+        score(network, METADATA, [View(VIEW.image, np.full_like(depth, 12.0), VIEW.K)])
