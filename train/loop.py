@@ -97,7 +97,8 @@ def train(
     if world() > 1 and not config.freeze_norm:
         share_norms(network)
     optimiser = build_optimiser(network, config)
-    state = TrainState(network, averaged, optimiser, arithmetic=numbers, scaler=numbers.scaler())
+    scaler = torch.amp.GradScaler(numbers.device.type, enabled=numbers.dtype is torch.float16)
+    state = TrainState(network, averaged, optimiser, numbers, scaler)
     if not resume(state, out / LAST) and before is not None:
         state.best, state.history = before["score"], [{"step": 0.0, **before}]
     if state.step > config.steps:
@@ -301,7 +302,7 @@ def _step(
     state.scaler.unscale_(state.optimiser)
     norm = nn.utils.clip_grad_norm_([p for p in network.parameters() if p.grad is not None], config.clip_norm)
     # The scaler leaves out a step whose float16 gradients overflow, and scales less from then on.
-    if not state.arithmetic.scales and not torch.isfinite(norm):
+    if not state.scaler.is_enabled() and not torch.isfinite(norm):
         raise NonFiniteLossError(f"step {state.step}: the gradient is not finite")
     state.whole = False
     state.scaler.step(state.optimiser)

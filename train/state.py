@@ -15,7 +15,7 @@ from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.models.device import DEVICES
 from edgeslam_torch.models.trainable import DepthModule
-from edgeslam_torch.train.processes.device import Arithmetic, arithmetic
+from edgeslam_torch.train.processes.device import Arithmetic
 
 MAX_BATCH = 1024
 """Images: tens of gigabytes."""
@@ -90,6 +90,9 @@ class TrainState:
     network: DepthModule
     averaged: DepthModule
     optimiser: torch.optim.Optimizer
+    arithmetic: Arithmetic
+    scaler: torch.amp.GradScaler
+    """Of float16 alone, whose gradients vanish below 6e-8."""
     step: int = 0
     best: float = math.inf
     best_step: int = 0
@@ -104,9 +107,6 @@ class TrainState:
     """Buffers of norms that learn, as they were before the step that is under way: its forward pass changes them."""
     stop: str = ""
     """Why training is to end after this step; a hook may write it. Not empty in one process, it ends all."""
-    arithmetic: Arithmetic = field(default_factory=lambda: arithmetic("cpu", amp=False))
-    scaler: torch.amp.GradScaler = field(default_factory=lambda: torch.amp.GradScaler("cpu", enabled=False))
-    """Of float16 alone."""
 
 
 def save_state(state: TrainState, path: Path) -> None:

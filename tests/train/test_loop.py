@@ -490,7 +490,8 @@ def test_float16_leaves_out_steps_that_overflow(tmp_path, monkeypatch):
     """The first scale, 65536, is too large for these losses; the scaler halves it until it fits."""
     half = Arithmetic(torch.device("cpu"), torch.float16)
     monkeypatch.setattr(loop, "arithmetic", lambda device, amp: half)
-    monkeypatch.setattr(Arithmetic, "scaler", lambda self: torch.amp.GradScaler("cpu", init_scale=2.0**40))
+    real = torch.amp.GradScaler
+    monkeypatch.setattr(torch.amp, "GradScaler", lambda device, enabled: real(device, 2.0**40, enabled=enabled))
     scales = []
 
     class Record(Hooks):

@@ -16,18 +16,9 @@ class Arithmetic:
     dtype: torch.dtype | None
     """None: float32 everywhere."""
 
-    @property
-    def scales(self) -> bool:
-        """Whether gradients must be scaled: those of float16 vanish below 6e-8."""
-        return self.dtype is torch.float16
-
     def autocast(self) -> torch.autocast:
         """Context of the forward pass and the losses."""
         return torch.autocast(self.device.type, self.dtype or torch.bfloat16, enabled=self.dtype is not None)
-
-    def scaler(self) -> torch.amp.GradScaler:
-        """Scales losses, unless that is not needed."""
-        return torch.amp.GradScaler(self.device.type, enabled=self.scales)
 
     def moved(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """A batch on the device."""
