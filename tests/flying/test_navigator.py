@@ -190,7 +190,7 @@ def test_nothing_ahead_is_no_corridor():
     with navigator() as nav:
         nav.take_off()
         outcome = nav.follow_corridor(0.5)
-        assert not outcome.reached and outcome.reason == "there is not a corridor here"
+        assert not outcome.reached and outcome.reason == "there is no corridor here"
         with pytest.raises(FlightRefused, match="more than 0"):
             nav.follow_corridor(0.0)
 

@@ -104,7 +104,7 @@ class FollowCorridor(Skill):
         if not (room or ends or result is not None):
             return None
         if self._trail is None or len(self._trail.places_w) < 2:
-            return Result(False, "there is not a corridor here")
+            return Result(False, "there is no corridor here")
         if room:
             return Result(True, "the corridor opens into a room")
         if ends:
