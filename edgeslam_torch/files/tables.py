@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,8 +31,7 @@ _MIXED = re.compile(r"\s*[,;\t]\s*|\s+")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?|[+-]?\d+,")
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(NamedTuple):
     """One line with data."""
 
     line: int
@@ -221,7 +221,8 @@ def _all_numbers(line: str) -> bool:
 
 
 def _mixed(line: str) -> list[str]:
-    return _MIXED.split(line.split("#", 1)[0].strip())
+    line = line.split("#", 1)[0].strip()
+    return _MIXED.split(line) if "," in line or ";" in line or "\t" in line else line.split()
 
 
 def _split(line: str, separator: str | None, columns: int | None) -> list[str]:

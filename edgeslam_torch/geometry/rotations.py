@@ -77,9 +77,20 @@ def matrices_from_vectors(phi: FloatArray) -> FloatArray:
     return np.eye(3) + np.sinc(2.0 * half) * across + 0.5 * np.sinc(half) ** 2 * (across @ across)
 
 
-def vectors_from_matrices(R: FloatArray) -> FloatArray:
-    """Rotation vectors ``(..., 3)`` [rad] of rotations ``(..., 3, 3)``, accurate for angles up to pi."""
-    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(R.reshape(-1, 3, 3), 0, -1)
+def matrices_from_quaternions(q: FloatArray) -> FloatArray:
+    """Rotations ``(N, 3, 3)`` of quaternions ``(N, 4)`` (x, y, z, w) of any length but zero."""
+    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+        [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def quaternions_from_matrices(R: FloatArray) -> FloatArray:
+    """Unit quaternions ``(N, 4)`` (x, y, z, w), ``w >= 0``, of rotations ``(N, 3, 3)``."""
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(R, 0, -1)
     # Rows are the quaternion (w, x, y, z) times four of its components; the longest one is accurate (Shepperd 1978).
     rows = np.array(
         [
@@ -89,13 +100,23 @@ def vectors_from_matrices(R: FloatArray) -> FloatArray:
             [d - b, c + g, f + h, 1.0 - a - e + i],
         ]
     )
-    w, *xyz = rows[np.einsum("iin->in", rows).argmax(axis=0), :, np.arange(len(a))].T
-    vector = np.copysign(1.0, w) * np.array(xyz)
-    sine = np.linalg.norm(vector, axis=0)
-    small = sine < 1e-9 * np.abs(w)
-    angle = 2.0 * np.arctan2(sine, np.abs(w))
-    scale = np.where(small, 2.0 / np.where(small, np.abs(w), 1.0), angle / np.where(small, 1.0, sine))
-    return np.asarray((scale * vector).T.reshape(R.shape[:-1]))
+    wxyz = rows[np.einsum("iin->in", rows).argmax(axis=0), :, np.arange(len(a))]
+    length = np.copysign(np.linalg.norm(wxyz, axis=1, keepdims=True), wxyz[:, :1])
+    return np.asarray((wxyz / length)[:, [1, 2, 3, 0]])
+
+
+def vectors_from_matrices(R: FloatArray) -> FloatArray:
+    """Rotation vectors ``(..., 3)`` [rad] of rotations ``(..., 3, 3)``, accurate for angles up to pi."""
+    *xyz, w = quaternions_from_matrices(R.reshape(-1, 3, 3)).T
+    sine = np.linalg.norm(xyz, axis=0)
+    small = sine < 1e-9
+    scale = np.where(small, 2.0, 2.0 * np.arctan2(sine, w) / np.where(small, 1.0, sine))
+    return np.asarray((scale * np.array(xyz)).T.reshape(R.shape[:-1]))
+
+
+def angles(R: FloatArray) -> FloatArray:
+    """Angles ``(N,)`` [rad] of rotations ``(N, 3, 3)``, from 0 to pi."""
+    return np.asarray(np.linalg.norm(vectors_from_matrices(R), axis=-1))
 
 
 def rotated(R: FloatArray, p: FloatArray) -> FloatArray:
@@ -116,8 +137,14 @@ def smallest_rotation(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def fitted_rotation(a: FloatArray, b: FloatArray) -> FloatArray:
     """The rotation ``(3, 3)`` that takes vectors ``a`` to ``b``, ``(N, 3)`` each, with the least error (Wahba)."""
-    U, _, Vt = np.linalg.svd(b.T @ a)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+    return nearest_rotation(b.T @ a)
+
+
+def nearest_rotation(M: FloatArray) -> FloatArray:
+    """Rotations ``(..., 3, 3)`` nearest to matrices ``(..., 3, 3)`` in the Frobenius norm."""
+    U, _, Vt = np.linalg.svd(M)
+    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
+    return np.asarray(U @ Vt)
 
 
 def wrapped(angle: FloatArray) -> FloatArray:
@@ -127,6 +154,4 @@ def wrapped(angle: FloatArray) -> FloatArray:
 
 def mean_rotation(R: FloatArray, weights: FloatArray | None = None) -> FloatArray:
     """Chordal mean ``(3, 3)`` of rotations ``(N, 3, 3)`` (Hartley et al. 2013, section 5.3)."""
-    M = np.tensordot(np.ones(len(R)) if weights is None else weights, R, axes=1)
-    U, _, Vt = np.linalg.svd(M)
-    return U @ np.diag([1.0, 1.0, float(np.linalg.det(U @ Vt))]) @ Vt
+    return nearest_rotation(np.tensordot(np.ones(len(R)) if weights is None else weights, R, axes=1))

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from edgeslam_torch.calibration.camera_choice import known_camera
 from edgeslam_torch.errors import CalibrationError, EdgeSlamError, SourceError
@@ -15,6 +14,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import nearest
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.rotations import matrices_from_vectors, vectors_from_matrices
 from edgeslam_torch.readers.layouts import read_sequence
 from edgeslam_torch.readers.sequence import DepthMaps, Sequence
 from edgeslam_torch.types import FloatArray
@@ -116,10 +116,13 @@ def interpolate(trajectory: Trajectory, stamps_s: FloatArray) -> tuple[FloatArra
     if len(known) < 2:
         return T, np.zeros(len(stamps_s), dtype=bool)
     inside = np.clip(stamps_s, known[0], known[-1])
-    T[:, :3, :3] = Slerp(known, Rotation.from_matrix(trajectory.T_w_c[:, :3, :3]))(inside).as_matrix()
     for axis in range(3):
         T[:, axis, 3] = np.interp(inside, known, trajectory.positions[:, axis])
     right = np.clip(np.searchsorted(known, inside), 1, len(known) - 1)
+    share = ((inside - known[right - 1]) / (known[right] - known[right - 1]))[:, None]
+    R, R_next = (trajectory.T_w_c[i, :3, :3] for i in (right - 1, right))
+    turn = vectors_from_matrices(np.swapaxes(R, 1, 2) @ R_next)
+    T[:, :3, :3] = R @ matrices_from_vectors(share * turn)
     exact = np.abs(known[nearest(known, stamps_s)] - stamps_s) < 1e-4
     return T, exact | ((known[right] - known[right - 1] <= _MAX_TRUTH_GAP_S) & (inside == stamps_s))
 

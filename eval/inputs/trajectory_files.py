@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.columns import Columns, columns_by_name, columns_by_number
@@ -19,6 +18,7 @@ from edgeslam_torch.files.record_files import plain_yaml
 from edgeslam_torch.files.tables import Table, read_table
 from edgeslam_torch.files.time_units import UNKNOWN, seconds_of
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import matrices_from_quaternions, nearest_rotation
 from edgeslam_torch.types import FloatArray
 from edgeslam_torch.writers.run_writer import tum_line
 
@@ -165,7 +165,7 @@ def _from_columns(table: Table, columns: Columns, path: Path) -> Trajectory:
         if odd.any():
             notes.append(f"{np.count_nonzero(odd)} poses without a unit quaternion were left out")
         stamps_s, T = stamps_s[~odd], T[~odd]
-        T[:, :3, :3] = Rotation.from_quat(poses[~odd, 3:]).as_matrix()
+        T[:, :3, :3] = matrices_from_quaternions(poses[~odd, 3:])
     stamps_s, T = _increasing(stamps_s, T, str(path), notes)
     return Trajectory(stamps_s, T, str(path), tuple(notes), oriented=columns.quaternion is not None)
 
@@ -246,7 +246,7 @@ def _from_matrices(stamps_s: FloatArray, T: FloatArray, source: str, notes: list
     stamps_s, T = _finite(stamps_s, T, source, notes)
     if np.median(np.abs(np.linalg.det(T[:, :3, :3]) - 1.0)) > 0.05:
         raise EvaluationError(f"{source}: the 3x3 parts are not rotations (determinant not 1)")
-    T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
+    T[:, :3, :3] = nearest_rotation(T[:, :3, :3])
     stamps_s, T = _increasing(stamps_s, T, source, notes)
     return Trajectory(stamps_s, T, source, tuple(notes))
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, match, possible_pairs
 from edgeslam_torch.eval.inputs.clocks import on_one_clock
@@ -16,6 +15,12 @@ from edgeslam_torch.eval.metrics.align import AlignmentKind, misfit
 from edgeslam_torch.eval.metrics.clock_offset import best_offset
 from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore, without_orientation
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import (
+    angles,
+    matrices_from_quaternions,
+    mean_rotation,
+    quaternions_from_matrices,
+)
 from edgeslam_torch.types import FloatArray
 
 _POOR = 0.3
@@ -212,8 +217,8 @@ def _transposed(trajectory: Trajectory) -> Trajectory:
 
 def _read_w_first(trajectory: Trajectory) -> Trajectory:
     """What was read as qx qy qz qw taken for qw qx qy qz."""
-    read = Rotation.from_matrix(trajectory.T_w_c[:, :3, :3]).as_quat()
-    return _turned(trajectory, Rotation.from_quat(read[:, [1, 2, 3, 0]]).as_matrix())
+    read = quaternions_from_matrices(trajectory.T_w_c[:, :3, :3])
+    return _turned(trajectory, matrices_from_quaternions(read[:, [1, 2, 3, 0]]))
 
 
 def _turned(trajectory: Trajectory, R: FloatArray) -> Trajectory:
@@ -235,6 +240,6 @@ def _rotation_error(truth: Trajectory, estimate: Trajectory, score: TrajectorySc
     """
     pairs = score.association
     R_true, R = truth.T_w_c[pairs.truth, :3, :3], estimate.T_w_c[pairs.estimate, :3, :3]
-    error = Rotation.from_matrix(np.swapaxes(R_true, 1, 2) @ score.alignment.R @ R)
-    spread = (error.mean().inv() * error).magnitude()
-    return float(np.degrees(np.median(error.magnitude()))), float(np.degrees(np.median(spread)))
+    error = np.swapaxes(R_true, 1, 2) @ score.alignment.R @ R
+    spread = angles(mean_rotation(error).T @ error)
+    return float(np.degrees(np.median(angles(error)))), float(np.degrees(np.median(spread)))

@@ -2,14 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.metrics.align import Alignment, umeyama
-from edgeslam_torch.eval.metrics.surface import SurfaceTruth
+from edgeslam_torch.eval.metrics.surface import SurfaceTruth, search_tree
 from edgeslam_torch.types import FloatArray
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 THRESHOLDS_M = (0.02, 0.06, 0.10)
 """Distances at which accuracy, completeness and F-score are given."""
@@ -75,7 +78,7 @@ def score_map(
     accuracy = {t: float(np.mean(distance <= t)) for t in thresholds_m}
     completeness, f_score = {}, {}
     if len(truth.edges_w):
-        tree = cKDTree(p, balanced_tree=False, compact_nodes=False)
+        tree = search_tree(p)
         gap, _ = tree.query(truth.edges_w, distance_upper_bound=1.01 * max(thresholds_m))
         completeness = {t: float(np.mean(gap <= t)) for t in thresholds_m}
         f_score = {t: _harmonic(accuracy[t], completeness[t]) for t in thresholds_m}
@@ -94,7 +97,7 @@ def score_map(
     )
 
 
-def _median_after_icp(p: FloatArray, tree: cKDTree) -> float:
+def _median_after_icp(p: FloatArray, tree: "cKDTree") -> float:
     """Median distance of points ``(P, 3)`` to the tree's after aligning the nearer 70 % of them to it, ten times."""
     p = p[:: max(1, len(p) // _MAX_ICP)]
     if len(p) < 10:

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import nearest
@@ -17,6 +17,9 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.images import pixels_or_none
 from edgeslam_torch.readers.sequence import DepthMaps, register_depth
 from edgeslam_torch.types import FloatArray
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 MAX_DEPTH_M = 5.0
 """A Kinect's noise grows with the square of the distance: 7 cm at 5 m (Khoshelham & Elberink 2012)."""
@@ -41,7 +44,7 @@ nearest depth is an edge's: it belongs to the occluding side."""
 class SurfaceTruth:
     """Measured surface and edges in the ground truth's world frame."""
 
-    tree: cKDTree
+    tree: "cKDTree"
     """Over the fused cloud ``(P, 3)`` [m]."""
     edges_w: FloatArray
     """``(Q, 3)`` edge points [m]."""
@@ -80,7 +83,7 @@ class SurfaceTruth:
         for k, (depth, T) in enumerate(zip(self.depth_m[::step], self.T_d_w[::step], strict=True)):
             p_d = se3.transform(T, p_w)
             index, reading = self._readings(depth, p_d)
-            distance = _tree(_points(depth, self.camera, np.eye(4))).query(p_d[index])[0].astype(np.float32)
+            distance = search_tree(_points(depth, self.camera, np.eye(4))).query(p_d[index])[0].astype(np.float32)
             behind = p_d[index, 2] > reading + _HIDDEN_M
             found[index[~behind], k] = distance[~behind]
             hidden[index[behind]] = np.minimum(hidden[index[behind]], distance[behind])
@@ -131,11 +134,14 @@ def build_surface(dataset: EvalDataset) -> SurfaceTruth:
         clouds.append(_thinned(_points(maps[-1], small, T_w_d[i])))
         if i in edge_index:
             edges.append(_edge_points(dataset, measured, depth, int(i)))
-    tree = _tree(_thinned(np.concatenate(clouds)))
+    tree = search_tree(_thinned(np.concatenate(clouds)))
     return SurfaceTruth(tree, _agreed(edges), np.stack(maps), se3.inverse(T_w_d[index]), small)
 
 
-def _tree(p: FloatArray) -> cKDTree:
+def search_tree(p: FloatArray) -> "cKDTree":
+    """For the nearest of points ``(N, 3)``; built at once and unbalanced, as it is asked only once."""
+    from scipy.spatial import cKDTree  # 0.7 s to import, which a run without depth maps does not need
+
     return cKDTree(p, balanced_tree=False, compact_nodes=False)
 
 

@@ -8,7 +8,6 @@ that the paper prints as its 0.046 (eq. 30 without the lost ``- I``). RPE is Stu
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, Association, associate, nearest
@@ -17,6 +16,7 @@ from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.eval.metrics.align import Alignment, AlignmentKind, rms, umeyama
 from edgeslam_torch.eval.metrics.clock_offset import any_offset
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import angles
 from edgeslam_torch.types import FloatArray, IntArray
 
 DRIFT_SEGMENTS_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
@@ -183,7 +183,7 @@ def without_orientation(truth: Trajectory, estimate: Trajectory) -> Trajectory |
 def _spread_deg(trajectory: Trajectory) -> float:
     """Largest angle [deg] between the first orientation and another."""
     R = trajectory.T_w_c[:, :3, :3]
-    return float(np.degrees(Rotation.from_matrix(R[0].T @ R).magnitude().max()))
+    return float(np.degrees(angles(R[0].T @ R).max()))
 
 
 def _clock_hints(truth: Trajectory, estimate: Trajectory) -> list[str]:
@@ -244,7 +244,7 @@ def _relative(name: str, T_true: FloatArray, T: FloatArray, i: IntArray, j: IntA
 def _angle_deg(T: FloatArray) -> FloatArray:
     if len(T) == 0 or not np.isfinite(T).all():
         return np.full(len(T), np.nan)
-    return np.degrees(Rotation.from_matrix(T[:, :3, :3]).magnitude())
+    return np.degrees(angles(T[:, :3, :3]))
 
 
 def _path(T: FloatArray) -> FloatArray:

@@ -5,10 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.geometry.rotations import (
+    angles,
     fitted_rotation,
+    matrices_from_quaternions,
     matrices_from_rpy,
     matrices_from_vectors,
     matrix_from_rpy,
+    quaternions_from_matrices,
     smallest_rotation,
     vectors_from_matrices,
 )
@@ -26,6 +29,13 @@ def test_rotation_vectors_there_and_back(rng, angle):
     np.testing.assert_allclose(R, Rotation.from_rotvec(phi).as_matrix(), atol=1e-14)
     np.testing.assert_allclose(vectors_from_matrices(R), phi, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(vectors_from_matrices(R[0]), phi[0], rtol=1e-12, atol=1e-15)
+
+
+def test_quaternions_there_and_back(rng):
+    R = Rotation.random(50, random_state=rng)
+    np.testing.assert_allclose(quaternions_from_matrices(R.as_matrix()), R.as_quat(canonical=True), atol=1e-12)
+    np.testing.assert_allclose(matrices_from_quaternions(3.0 * R.as_quat()), R.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(angles(R.as_matrix()), R.magnitude(), atol=1e-12)
 
 
 def test_half_a_turn_has_a_vector(rng):
