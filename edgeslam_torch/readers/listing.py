@@ -95,15 +95,19 @@ def entries_in_time(
 
 
 def image_times(stamps: ArrayLike, name: str, unit: str = "s") -> tuple[FloatArray, list[Problem]]:
-    """Stamps in seconds, and a remark if they are in another unit than ``unit`` or plausible in none.
+    """Stamps in seconds, and a remark if they are in another unit than ``unit``, plausible in none, or frame numbers.
 
     Dates of our time are in no doubt and need no remark. ``name`` is for messages.
     """
     seconds, found = seconds_of(stamps)
-    if len(seconds) < 2 or found == unit or (found != UNKNOWN and is_date(seconds)):
+    gaps = np.abs(np.diff(seconds))
+    counted = found == "s" and len(gaps) > 1 and gaps[0] >= 1.0 and bool(np.all(gaps == gaps[0]))
+    if len(seconds) < 2 or (found == unit and not counted) or (found != UNKNOWN and is_date(seconds)):
         return seconds, []
-    gap = np.median(np.abs(np.diff(seconds)))
-    if found == UNKNOWN:
+    gap = np.median(gaps)
+    if counted:
+        reason = f"stamps are exactly {gap:g} s apart: frame numbers? They are taken as seconds"
+    elif found == UNKNOWN:
         reason = f"stamps are {gap:.3g} apart, which is the time between two images in no unit; taken as seconds"
     else:
         reason = f"stamps are read as {NAMES[found]}: the images are {gap:.3g} s apart"

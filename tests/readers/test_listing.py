@@ -67,6 +67,14 @@ def test_stamps_in_any_unit_become_seconds_and_a_relative_clock_is_said(begin_s,
     assert [word in problem.reason for problem in problems] == ([True] if word and begin_s < 1e9 else [])
 
 
+@pytest.mark.parametrize(("step", "said"), [(1, True), (10, True), (0.5, False), (1.01, False)])
+def test_frame_numbers_in_place_of_stamps_are_said(step, said):
+    stamps = step * np.arange(30) + 0.001 * (step == 1.01) * np.arange(30) ** 2
+    kept, problems = entries_in_time(stamps, [Path(f"{i}.png") for i in range(30)], "rgb.txt")
+    assert len(kept) == 30
+    assert bool(problems) == said
+
+
 def test_stamps_in_no_unit_are_said():
     kept, problems = entries_in_time(np.arange(5) * 1e-5, [Path(f"{i}.png") for i in range(5)], "rgb.txt")
     assert len(kept) == 5
