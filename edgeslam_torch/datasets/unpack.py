@@ -1,12 +1,13 @@
 """Archives unpacked as if their authors were hostile: nothing leaves the folder, no links, a bounded size."""
 
+import errno
 import lzma
 import shutil
 import struct
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -26,6 +27,8 @@ _DAMAGED = (
     *(RuntimeError, NotImplementedError, ValueError, LookupError, OverflowError),
 )
 """What Python's archives raise for bytes that are none; names that are no text are a `ValueError`."""
+_DAMAGED_ERRNO = (None, errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.EINVAL, errno.EILSEQ)
+"""Of an `OSError` that the archive is to blame for: gzip and bzip2 state none; names that no folder can hold."""
 MAX_TAR_HEADER_BYTES = 1 << 20
 """Of one extended header, which `tarfile` reads whole."""
 _ARCHIVES = (".zip", ".tgz", ".tar.gz", ".tar")
@@ -158,8 +161,12 @@ def _opened(archive: Path) -> Iterator[tuple[list[_Member], _Reader]]:
                 yield _checked(archive, [_of_zip(archive, info) for info in opened.infolist()]), _Reader(opened)
         else:
             with tarfile.open(archive, tarinfo=_TarInfo) as opened:
-                yield _checked(archive, [_of_tar(archive, info) for info in opened]), _Reader(opened)
-    except _DAMAGED as error:
+                files = _checked(archive, (_of_tar(archive, info) for info in opened))
+                _read_rest(opened)
+                yield files, _Reader(opened)
+    except (*_DAMAGED, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in _DAMAGED_ERRNO:
+            raise
         raise SourceError(f"{archive}: damaged, or no archive ({' '.join(str(error).split())[:120]})") from error
 
 
@@ -189,13 +196,26 @@ def _parts(archive: Path, name: str) -> tuple[str, ...]:
     return parts
 
 
-def _checked(archive: Path, members: list[_Member | None]) -> list[_Member]:
-    files = [m for m in members if m is not None and not any(part in _JUNK for part in m.parts)]
-    size, packed = sum(m.size for m in files), archive.stat().st_size
-    if len(files) > MAX_FILES or size > MAX_GROWTH * packed + (16 << 20):
-        raise SourceError(
-            f"{archive}: would unpack to {len(files)} files of {size / 1e9:.1f} GB; too much for a recording"
-        )
+def _read_rest(archive: tarfile.TarFile) -> None:
+    """Read a tar to the end of its stream, where the checksum of the whole is."""
+    while archive.fileobj is not None and archive.fileobj.read(1 << 20):
+        pass
+
+
+def _checked(archive: Path, members: Iterable[_Member | None]) -> list[_Member]:
+    """The files, if they are no more than a recording has; the others of a bomb are not looked at."""
+    files: list[_Member] = []
+    size, most = 0, MAX_GROWTH * archive.stat().st_size + (16 << 20)
+    for member in members:
+        if member is None:
+            continue
+        size += member.size
+        if not any(part in _JUNK for part in member.parts):
+            files.append(member)
+        if len(files) > MAX_FILES or size > most:
+            raise SourceError(
+                f"{archive}: would unpack to {len(files)} files of {size / 1e9:.1f} GB or more; too much for a recording"
+            )
     if size > shutil.disk_usage(archive.parent).free:
         raise OSError(28, f"{size / 1e9:.1f} GB do not fit on the disk", str(archive.parent))
     return files

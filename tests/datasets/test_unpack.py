@@ -101,11 +101,19 @@ def test_damaged_archive_is_one_line(put, content):
     assert "\n" not in str(caught.value)
 
 
-def test_damaged_content_is_noticed(put):
-    content = bytearray(zipped({"x/a": b"abcdefgh" * 100}))
-    content[100] ^= 1
+@pytest.mark.parametrize("make", [zipped, tgz])
+def test_damaged_content_is_noticed(put, make, rng):
+    picture = rng.bytes(5000)  # as images do, it does not compress, so that only the checksum sees a changed byte
+    content = bytearray(make({"x/a": picture}))
+    content[content.find(picture[2000:2008])] ^= 1
     with pytest.raises(SourceError, match="damaged"):
         put(bytes(content))
+
+
+@pytest.mark.parametrize("names", [["x/a", "x/a/b"], ["x/" + 300 * "n"]], ids=["file and folder", "long"])
+def test_names_that_no_folder_can_hold_are_the_archives_fault(put, names):
+    with pytest.raises(SourceError, match="damaged"):
+        put(tgz(dict.fromkeys(names, b"1")))
 
 
 def test_part_that_is_not_there_is_named(put):
