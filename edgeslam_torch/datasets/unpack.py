@@ -214,7 +214,8 @@ def _checked(archive: Path, members: Iterable[_Member | None]) -> list[_Member]:
             files.append(member)
         if len(files) > MAX_FILES or size > most:
             raise SourceError(
-                f"{archive}: would unpack to {len(files)} files of {size / 1e9:.1f} GB or more; too much for a recording"
+                f"{archive}: would unpack to {len(files)} files of {size / 1e9:.1f} GB or more; "
+                "too much for a recording"
             )
     if size > shutil.disk_usage(archive.parent).free:
         raise OSError(28, f"{size / 1e9:.1f} GB do not fit on the disk", str(archive.parent))
