@@ -45,7 +45,6 @@ from edgeslam_torch.mapping.level.gravity import best_known, up_by_gravity
 from edgeslam_torch.mapping.level.straight_edges import up_by_edges
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.mapping.pipeline import MappingPipeline
-from edgeslam_torch.noise import MOUNT_RAD
 from edgeslam_torch.states.machine import Machine, State
 from edgeslam_torch.states.map_merging import MapMerging
 from edgeslam_torch.states.starting import FIRST_FRAME, Starting
@@ -323,24 +322,18 @@ class EdgeSlam:
         self._calibration_warning = calibration_warning(self.camera, self._shown_keyframes(), self.map.anchors.p_w)
 
     def _find_up(self) -> None:
-        """Find the vertical by IMU, attitude, or accelerometer and edges; level the world, but no loaded map's axes."""
-        system, felt_up = self._system, self._system.fusion.imu.up
-        if felt_up is not None and not self._earlier.pieces:
-            system.published = system.published.levelled(felt_up[0], np.zeros(3))
-            self.up = Up(np.array([0.0, 0.0, 1.0]), felt_up[1], "imu")
-            return
-        if system.published.upright and (not self._earlier.pieces or system.fusion.orientation.began_upright):
-            self.up = Up(np.array([0.0, 0.0, 1.0]), MOUNT_RAD, "telemetry")
-            return
-        shown = self._shown_keyframes()
-        by_edges = up_by_edges(shown, self.edges.hosts, self.camera)
-        whole = self.support().whole()
-        stamps_s, T_w_c = self.log.poses()
-        leveled = up_by_gravity(ImuReadings.joined(system.fusion.imu.forces), self.imu, stamps_s[whole], T_w_c[whole])
-        up = best_known(leveled, by_edges)
+        """Level the world by IMU or attitude, else by accelerometer and edges; a loaded map's axes stay."""
+        system = self._system
+        up = system.fusion.up()
+        if up is None:
+            by_edges = up_by_edges(self._shown_keyframes(), self.edges.hosts, self.camera)
+            whole = self.support().whole()
+            stamps_s, T_w_c = self.log.poses()
+            forces = ImuReadings.joined(system.fusion.imu.forces)
+            up = best_known(up_by_gravity(forces, self.imu, stamps_s[whole], T_w_c[whole]), by_edges)
         if up is None:
             return
-        if not system.published.upright:
+        if not (self._earlier.pieces and system.published.upright):
             system.published = system.published.levelled(up.direction, np.zeros(3))
         self.up = replace(up, direction=system.published.R @ up.direction)
 

@@ -334,6 +334,28 @@ def test_the_world_is_upright_although_attitude_arrives_late():
     assert np.linalg.norm(jump) < 0.06, "about the camera: two steps at most"
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_the_final_world_is_as_level_as_the_attitude_is_right(mirrored):
+    """The first attitude is 20 degrees off, the others are not. A mirrored one is not what levels the final world."""
+    film_ = film(stairs_world(), CAMERA, sideways(40, 0.03, turn_rad=0.02), step_s=1 / 15)
+    lean = Rotation.from_rotvec([0.0, 0.0, np.deg2rad(12.0)]).as_matrix()
+    R_w = lean @ first_pose(np.zeros(3), camera_on_body(np.deg2rad(12.0)))[:3, :3] @ film_.T_w_c[0, :3, :3].T
+    R_w = R_w @ Rotation.from_rotvec([0.0, 0.0, np.deg2rad(25.0)]).as_matrix()  # the camera rolls as it turns
+    R_w_b = R_w @ film_.T_w_c[:, :3, :3] @ camera_on_body(np.deg2rad(12.0))[:3, :3].T
+    slam = EdgeSlam(CAMERA, NO_NETWORK, depth=film_.depth_function())
+    for frame, R in zip(film_.frames, R_w_b, strict=True):
+        rpy = rpy_from_matrix(R) * (-1.0 if mirrored else 1.0) + np.deg2rad([20.0 * (frame.index == 0), 0.0, 0.0])
+        slam.step(frame, [TelemetrySample(frame.stamp_s, velocity_m_s=np.zeros(3), rpy_rad=rpy)])
+    slam.finish()
+    up = (R_w @ film_.T_w_c[:, :3, :3])[:, 2]  # in each camera
+    off = np.arccos([np.clip(T[2, :3] @ u, -1.0, 1.0) for T, u in zip(slam.trajectory()[1], up, strict=True)])
+    if mirrored:
+        assert slam.up is None or slam.up.source != "telemetry"
+    else:
+        assert slam.up.source == "telemetry"
+        assert off.max() < 2.0 * slam.up.sigma_rad < np.deg2rad(10.0), "the delay is not known yet"
+
+
 def test_an_attitude_that_comes_in_flight_and_has_proven_nothing_does_not_turn_the_world():
     """It may be of another moment, or of another flight: the first one that it tells is 20 degrees off."""
     film_ = panels()

@@ -32,6 +32,7 @@ from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, Senso
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, VisualMemory, VisualPose
 from edgeslam_torch.estimation.telemetry_scale import AROUND_S, TelemetryScale, drift_in_words, scale_of
+from edgeslam_torch.geometry.level import Up
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.noise import VISUAL_SIGMA
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
@@ -248,6 +249,13 @@ class MotionFusion:
         last = self._memory.last
         view = self._filter.view(stamp_s) if last is not None and stamp_s > last.stamp_s else None
         return None if view is None else view.in_map(self.scale(), self.flight.delay_sigma_s)
+
+    def up(self) -> Up | None:
+        """The vertical in the map, by the IMU or by an attitude that the images do not contradict."""
+        for source, found in (("imu", self.imu.up), ("telemetry", self.orientation.up)):
+            if found is not None:
+                return Up(*found, source)
+        return None
 
     def republished(self, published: OutputFrame, centre_map: FloatArray, keep_scale: bool) -> OutputFrame:
         """The published frame, levelled and, unless ``keep_scale``, with the present scale or guess; the

@@ -121,6 +121,17 @@ class Orientation:
         at_once = self._attitude_s - self.began_s < _AT_ONCE_S
         return self.found.R_w_m if at_once or self._flight.trust.turns else None
 
+    @property
+    def up(self) -> tuple[FloatArray, float] | None:
+        """The vertical ``(3,)`` in the map by an attitude that may level the world, and its standard deviation [rad]:
+        of the mount, and of attitudes of other moments than the poses, as the delay is uncertain."""
+        if self.found is None or self.upright() is None:
+            return None
+        flight = self._flight
+        at_s = flight.memory.sightings().stamps_s - flight.delay_s
+        leaned = float(np.median(flight.track.leaned(at_s, min(flight.delay_sigma_s, DELAY_S))))
+        return self.found.R_w_m[2], math.hypot(float(self.found.sigma_rad[:2].max()), leaned)
+
     def leaning(self) -> str | None:
         """Warning that no usable attitude levelled the world; None if the drone sent none."""
         if not math.isfinite(self._attitude_s):
