@@ -147,7 +147,7 @@ def test_video_of_too_many_pixels_is_refused(video, monkeypatch):
 def test_unusable_image_is_left_out_and_leaves_a_gap(tmp_path, write_images, suffix, damage):
     names = [f"{i}{suffix}" for i in range(4)]
     paths = write_images(tmp_path / "rgb", names)
-    (tmp_path / "rgb.txt").write_text("".join(f"{i} rgb/{n}\n" for i, n in enumerate(names)))
+    (tmp_path / "rgb.txt").write_text("".join(f"{0.1 * i} rgb/{n}\n" for i, n in enumerate(names)))
     if damage == "missing":
         paths[2].unlink()
     else:
