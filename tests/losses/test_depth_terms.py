@@ -57,14 +57,6 @@ def test_values_by_hand():
     assert masked_mean(r, r > 0).item() == pytest.approx(0.55)
 
 
-def test_silog_ignores_scale_when_fully_balanced():
-    x = torch.randn(1, 1, 5, 5)
-    mask = torch.ones_like(x, dtype=torch.bool)
-    torch.testing.assert_close(
-        SILog(1.0)(x + 0.7, torch.zeros_like(x), mask), SILog(1.0)(x, torch.zeros_like(x), mask), atol=1e-5, rtol=1e-4
-    )
-
-
 def test_uncertainty_is_best_at_the_mean_absolute_residual():
     """The optimum of |r| / b + log b is b = mean |r|; sigma = sqrt(2) b."""
     r = torch.tensor([0.1, -0.3, 0.2, 0.2]).view(1, 1, 2, 2)

@@ -116,20 +116,7 @@ def test_forward_reduces_squared_residuals(case):
     torch.testing.assert_close(case.loss(*case.arguments(*OFF)), total)
 
 
-@pytest.mark.parametrize("case", NAMES, indirect=True)
-def test_gradient_is_twice_jacobian_times_residual(case):
-    def residual(xi, s):
-        return case.loss.residuals(*case.arguments(xi, s)).value.flatten()
-
-    xi, s = OFF[0].clone().requires_grad_(), torch.tensor(OFF[1], dtype=torch.float64, requires_grad=True)
-    loss = case.loss(*case.arguments(xi, s))
-    gradient = torch.cat([g.flatten() for g in torch.autograd.grad(loss, (xi, s))])
-    J = torch.cat([j.reshape(len(residual(xi, s)), -1) for j in torch.func.jacrev(residual, (0, 1))(xi, s)], 1)
-    scale = loss / residual(xi, s).square().sum()
-    torch.testing.assert_close(gradient, scale * 2.0 * J.mT @ residual(xi, s), rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("kernel", [Kernel.HUBER, Kernel.CAUCHY, Kernel.TUKEY])
+@pytest.mark.parametrize("kernel", list(Kernel))
 @pytest.mark.parametrize("case", NAMES, indirect=True)
 def test_gradient_under_a_kernel_is_twice_weighted_jacobian_times_residual(case, kernel):
     loss = case.loss
@@ -145,23 +132,6 @@ def test_gradient_under_a_kernel_is_twice_weighted_jacobian_times_residual(case,
     cost, weight = rho(r.square().sum(-1), kernel, loss.delta)
     expected = 2.0 * torch.einsum("n,nr,nrk->k", weight, r, J) * loss(*case.arguments(*OFF)) / cost.sum()
     torch.testing.assert_close(gradient, expected.detach(), rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("form", [AngleForm.RIGHT_ANGLE, AngleForm.SAME_FRAME])
-def test_gradient_of_the_other_angles_is_twice_jacobian_times_residual(form, rng):
-    w = world(rng)
-    corners, depth = w["uv"].view(8, 3, 2), w["depth"].view(8, 3).clone().requires_grad_()
-    none, loss = torch.full((8,), torch.nan, dtype=torch.float64), AngleLoss(form, gate_cos=0.9)
-
-    def residual(d):
-        return loss.residuals(w["T_j_i"], corners, d, none, K).value[:, 0]
-
-    valid = loss.residuals(w["T_j_i"], corners, depth, none, K).valid
-    assert valid.sum() > 2
-    (gradient,) = torch.autograd.grad(loss(w["T_j_i"], corners, depth, none, K), depth)
-    J = torch.func.jacrev(residual)(depth.detach())
-    expected = 2.0 * torch.einsum("n,nck->ck", residual(depth.detach()), J) / valid.sum()
-    torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("literal", [False, True])
@@ -222,12 +192,6 @@ def test_right_angle_prior_pulls_only_nearly_square_corners():
         assert float(loss(eye, *corner(degrees), none, K)) == pytest.approx(expected, abs=1e-12)
 
 
-def test_collinearity_does_not_depend_on_scale_unless_literal(rng):
-    p = torch.tensor(rng.normal(size=(3, 2, 6, 3)) + [0, 0, 5], dtype=torch.float64)
-    torch.testing.assert_close(CollinearityLoss()(p), CollinearityLoss()(0.01 * p))
-    torch.testing.assert_close(CollinearityLoss(literal=True)(0.01 * p), 1e-4 * CollinearityLoss(literal=True)(p))
-
-
 @pytest.mark.parametrize("literal", [False, True])
 def test_gradient_of_collinearity_does_not_shrink_the_scene_unless_literal(literal, rng):
     """What does not change with the scale must not have a gradient along it."""
@@ -235,14 +199,6 @@ def test_gradient_of_collinearity_does_not_shrink_the_scene_unless_literal(liter
     value = CollinearityLoss(literal)(p)
     (gradient,) = torch.autograd.grad(value, p)
     assert float((gradient * p).sum().detach() / value.detach()) == pytest.approx(2.0 if literal else 0.0, abs=1e-9)
-
-
-def test_arm_of_even_points_is_as_long_as_it_looks():
-    steps = torch.linspace(0, 1, 5, dtype=torch.float64)[:, None]
-    arm = steps * torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64)
-    bent = arm + torch.tensor([[0.0], [1.0], [0.0], [-1.0], [0.0]]) * torch.tensor([0.0, 0.0, 1e-3]).double()
-    arms = torch.stack((bent, arm))[None]
-    assert float(CollinearityLoss()(arms) / CollinearityLoss(literal=True)(arms)) == pytest.approx(0.25, rel=1e-5)
 
 
 def test_collinearity_of_a_known_bend():

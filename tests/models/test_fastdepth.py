@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.complexity import measure_complexity
-from edgeslam_torch.models.fastdepth import FULL, PRUNED, FastDepth, Output, Variant, Widths
+from edgeslam_torch.models.fastdepth import FastDepth, Output, Variant
 from edgeslam_torch.models.mobilenet import SameConv2d
 
 
@@ -35,17 +34,6 @@ def test_names_and_shapes_are_upstreams():
     assert plain["decoder.conv1.0.weight"].shape == (512, 1024, 5, 5)
     assert "decoder.conv1.1.0.weight" in FastDepth(Variant.NNCONV5DW).state_dict()
     assert not any(k.startswith("uncertainty") for k in skips)
-
-
-@pytest.mark.parametrize("variant", [Variant.SKIPADD, Variant.PRUNED, Variant.NNCONV5DW])
-def test_widths_come_back_from_a_state_dict(variant):
-    expected = PRUNED if variant is Variant.PRUNED else FULL
-    assert Widths.of_state_dict(FastDepth(variant).state_dict()) == expected
-
-
-def test_widths_of_something_else_are_refused():
-    with pytest.raises(WeightsError, match="not a FastDepth"):
-        Widths.of_state_dict({"fc.weight": torch.zeros(3)})
 
 
 @pytest.mark.parametrize("size", [(32, 64), (96, 32)])

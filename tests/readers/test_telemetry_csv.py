@@ -1,4 +1,5 @@
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -6,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edgeslam_torch.drone.sdk_state import FIELDS, parse_state, sample_from_sdk
-from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.readers.telemetry_csv import (
     HEADER,
     TelemetryError,
@@ -16,7 +16,6 @@ from edgeslam_torch.readers.telemetry_csv import (
     read_table,
     read_telemetry,
 )
-from edgeslam_torch.synthetic.flights.telemetry import simulate
 
 REAL = (
     "mid:-1;x:0;y:0;z:0;mpry:0,0,0;pitch:3;roll:-1;yaw:0;vgx:0;vgy:0;vgz:0;templ:50;temph:54;tof:10;h:0;bat:51;"
@@ -52,19 +51,12 @@ def test_sdk_1_3_form_is_parsed():
 
 
 @pytest.mark.parametrize(
-    "packet", [b"", b"ok", b"\xff\xfe\x00", b";;;:::", b"vgx:;bat:nan;tof:inf;yaw:1_0", b"a" * 9000]
+    "packet",
+    [b"", b"\xff\xfe\x00", b"vgx:;bat:nan;tof:inf;yaw:1_0", b"tof:6553;bat:300;vgx:1000000;vgy:0;vgz:0"],
 )
-def test_malformed_packets_give_missing_values(packet):
+def test_what_no_tello_gives_is_missing(packet):
     sample = sample_from_sdk(0.0, parse_state(packet))
-    assert np.isnan(sample.velocity_m_s).all()
-    assert math.isnan(sample.battery)
-
-
-def test_readings_no_tello_gives_are_missing():
-    sample = sample_from_sdk(0.0, {"tof": 6553.0, "bat": 300.0, "vgx": 1e6, "vgy": 0.0, "vgz": 0.0})
-    assert math.isnan(sample.tof_m)
-    assert math.isnan(sample.battery)
-    assert math.isnan(sample.velocity_m_s[0])
+    assert np.isnan([sample.velocity_m_s[0], sample.tof_m, sample.battery]).all()
 
 
 def test_what_is_written_is_read_back(tmp_path):
@@ -132,23 +124,16 @@ def test_implausible_numbers_are_reported_as_without_a_unit(tmp_path, header, va
 
 
 @pytest.mark.parametrize(
-    ("text", "word"), [("", "empty"), ("a,b\n1,2\n", "no clock"), ("stamp_s,colour\n1,2\n", "no known column")]
-)
-def test_files_that_are_no_telemetry_are_refused_in_one_line(tmp_path, text, word):
-    path = write(tmp_path, text)
-    with pytest.raises(TelemetryError, match=word) as caught:
+    "content", [None, b"", b"a,b\n1,2\n", b"stamp_s,colour\n1,2\n", bytes(range(256)), b"stamp_s,tof (furlong)\n0,1\n",
+                b"stamp_s,yaw\n" + 160 * b"noon,1\n"],
+)  # fmt: skip
+def test_files_that_are_no_telemetry_are_refused_in_one_line(tmp_path, content):
+    path = tmp_path / "telemetry.csv"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(TelemetryError) as caught:
         read_telemetry(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_missing_and_binary_files_are_refused(tmp_path):
-    with pytest.raises(TelemetryError, match="no such file"):
-        read_telemetry(tmp_path / "nothing.csv")
-    path = tmp_path / "picture.csv"
-    path.write_bytes(bytes(range(256)))
-    with pytest.raises(TelemetryError, match="not a text file"):
-        read_telemetry(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 def climbing(tmp_path, velocity_unit, sign):
@@ -180,83 +165,52 @@ def test_a_constant_height_determines_no_unit(tmp_path):
     assert "too little vertical motion" in detect_units(table).evidence
 
 
-def rewritten(tmp_path, how):
-    """The climbing flight as another program might have logged it."""
-    lines = climbing(tmp_path, 0.1, -1).read_text().splitlines()
-    head, rows = lines[0].split(","), [line.split(",") for line in lines[1:]]
-    if how == "other order":
-        order = [4, 3, 0, 2, 1]
-        head, rows = [head[i] for i in order], [[row[i] for i in order] for row in rows]
-    elif how == "semicolons, units in names":
-        head = ["Timestamp [ms]", "vgx (dm/s)", "vgy (dm/s)", "vgz (dm/s)", "ToF (cm)"]
-        return write(tmp_path, "\n".join(";".join(row) for row in [head, *rows]))
-    elif how == "quoted, separator at the end":
-        head, rows = [f'"{h}"' for h in head], [[*(f'"{c}"' for c in row), ""] for row in rows]
-    elif how == "dates":
-        rows = [
-            [f"2024-05-01 12:{int(row[0]) // 60000:02d}:{int(row[0]) % 60000 / 1e3:06.3f}", *row[1:]] for row in rows
-        ]
-    elif how == "motor time beside the clock":
-        head, rows = ["time", *head], [[str(int(row[0]) // 1000), *row] for row in rows]
-    elif how == "no horizontal velocity, index in front":
-        head, rows = ["", head[0], *head[3:]], [[str(k), row[0], *row[3:]] for k, row in enumerate(rows)]
-    elif how == "h instead of tof, some missing":
-        head = [*head[:4], "height_cm"]
-        rows = [
-            [*row[:3], "" if k % 7 == 0 else row[3], "None" if k % 5 == 0 else row[4]] for k, row in enumerate(rows)
-        ]
-    elif how == "furniture below":
-        rows = [[*row[:4], str(int(row[4]) - (45 if 40 < k % 100 < 70 else 0))] for k, row in enumerate(rows)]
-    elif how == "Windows line ends and a byte order mark":
-        return write(tmp_path, "\ufeff" + "\r\n".join(",".join(row) for row in [head, *rows]))
-    return write(tmp_path, "\n".join(",".join(row) for row in [head, *rows]))
+def date_of(ms):
+    return f"2024-05-01 12:{int(ms) // 60000:02d}:{int(ms) % 60000 / 1e3:06.3f}"
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        "other order",
-        "semicolons, units in names",
-        "quoted, separator at the end",
-        "dates",
-        "motor time beside the clock",
-        "no horizontal velocity, index in front",
-        "h instead of tof, some missing",
-        "furniture below",
-        "Windows line ends and a byte order mark",
-    ],
-)
+def lowered(k, row):
+    """Furniture under the drone shortens the range, not the flight."""
+    return [*row[:4], str(int(row[4]) - (45 if 40 < k % 100 < 70 else 0))]
+
+
+def gappy(k, row):
+    return [*row[:3], "" if k % 7 == 0 else row[3], "None" if k % 5 == 0 else row[4]]
+
+
+REWRITTEN = {
+    "other order": ("tof,vz,timestamp,vy,vx", lambda k, r: [r[i] for i in (4, 3, 0, 2, 1)]),
+    "quoted, separator at the end": ('"timestamp","vx","vy","vz","tof"', lambda k, r: [*(f'"{c}"' for c in r), ""]),
+    "dates": ("timestamp,vx,vy,vz,tof", lambda k, r: [date_of(r[0]), *r[1:]]),
+    "motor time beside the clock": ("time,timestamp,vx,vy,vz,tof", lambda k, r: [str(int(r[0]) // 1000), *r]),
+    "no horizontal velocity, index in front": (",timestamp,vz,tof", lambda k, r: [str(k), r[0], *r[3:]]),
+    "h in place of tof, some missing": ("timestamp,vx,vy,vz,height_cm", gappy),
+    "furniture below": ("timestamp,vx,vy,vz,tof", lowered),
+    "semicolons, units in names": ("Timestamp [ms];vgx (dm/s);vgy (dm/s);vgz (dm/s);ToF (cm)", lambda k, r: r),
+    "Windows line ends and a byte order mark": ("\ufefftimestamp,vx,vy,vz,tof", lambda k, r: r),
+}
+"""Header and rows of the climbing flight as other programs might log it."""
+
+
+@pytest.mark.parametrize("how", REWRITTEN)
 def test_a_flight_that_another_program_logged_is_read_the_same(tmp_path, how):
-    table = read_table(rewritten(tmp_path, how))
-    assert len(table.stamps_s) == 300
-    assert table.skipped == 0
+    rows = [line.split(",") for line in climbing(tmp_path, 0.1, -1).read_text().splitlines()[1:]]
+    header, change = REWRITTEN[how]
+    separator, end = ";" if ";" in header else ",", "\r\n" if "\ufeff" in header else "\n"
+    lines = [header, *(separator.join(change(k, row)) for k, row in enumerate(rows))]
+    table = read_table(write(tmp_path, end.join(lines)))
+    assert (len(table.stamps_s), table.skipped) == (300, 0)
     assert np.diff(table.stamps_s) == pytest.approx(np.full(299, 0.1), abs=1e-3)
     units = detect_units(table)
     assert (units.velocity_m_s, units.z_down, units.body_frame) == (0.1, True, False)
-    samples = table.samples(units)
-    assert samples[1].velocity_m_s[2] == pytest.approx(0.4 * math.cos(0.08), abs=0.01)
-    height = samples[1].height_m if how.startswith("h in") else samples[1].tof_m
-    assert height == pytest.approx(1.04, abs=0.011)
+    sample = table.samples(units)[1]
+    assert sample.velocity_m_s[2] == pytest.approx(0.4 * math.cos(0.08), abs=0.01)
+    assert (sample.height_m if how.startswith("h in") else sample.tof_m) == pytest.approx(1.04, abs=0.011)
 
 
 def test_units_can_be_given(tmp_path):
     path = climbing(tmp_path, 0.1, -1)
     assert read_telemetry(path, TelemetryUnits(0.01))[0][0].velocity_m_s[2] == pytest.approx(0.04, abs=0.001)
-
-
-def test_simulated_telemetry_is_read_as_its_maker_reads_it(rng, tmp_path):
-    t = np.arange(0.0, 12.0, 1 / 30)
-    T = np.tile(np.eye(4), (len(t), 1, 1))
-    T[:, 2, 3] = 1.0 + 0.3 * np.sin(t)
-    T[:, 0, 3] = 0.3 * np.sin(0.7 * t)
-    T_b_c = camera_on_body()
-    log = simulate(rng, t, T @ T_b_c, T_b_c)
-    log.write(tmp_path / "telemetry.csv")
-    for read, made in zip(read_telemetry(tmp_path / "telemetry.csv")[0], log.samples(), strict=True):
-        np.testing.assert_allclose(read.velocity_m_s, made.velocity_m_s, atol=1e-9)
-        np.testing.assert_allclose(read.rpy_rad, made.rpy_rad, atol=1e-9)
-        assert read.height_m == pytest.approx(made.height_m)
-        np.testing.assert_allclose(read.acceleration_m_s2, made.acceleration_m_s2, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.data
@@ -279,26 +233,19 @@ cells = st.one_of(
 lines = st.one_of(st.lists(cells, max_size=16).map(",".join), st.just(",".join(HEADER)), st.text(max_size=60))
 
 
-def _reads_or_refuses(folder, data):
-    path = folder / "fuzz.csv"
+TABLES = st.lists(lines, max_size=6).map(lambda rows: "\n".join([",".join(HEADER), *rows]))
+
+
+@given(st.one_of(TABLES.map(lambda text: text.encode("utf-8", "surrogatepass")), st.binary(max_size=300)))
+def test_anything_is_read_or_refused(tmp_path, data):
+    path = tmp_path / "fuzz.csv"
     path.write_bytes(data)
     try:
-        samples = read_telemetry(path)[0]
+        stamps = [s.stamp_s for s in read_telemetry(path)[0]]
     except TelemetryError as error:
         assert "\n" not in str(error)
-        return
-    stamps = [s.stamp_s for s in samples]
-    assert all(b > a for a, b in zip(stamps, stamps[1:], strict=False))
-
-
-@given(st.lists(lines, max_size=12))
-def test_any_csv_is_read_or_refused(tmp_path, rows):
-    _reads_or_refuses(tmp_path, "\n".join([",".join(HEADER), *rows]).encode("utf-8", "surrogatepass"))
-
-
-@given(st.binary(max_size=300))
-def test_any_bytes_are_read_or_refused(tmp_path, data):
-    _reads_or_refuses(tmp_path, data)
+    else:
+        assert all(b > a for a, b in pairwise(stamps))
 
 
 @given(st.one_of(st.binary(max_size=300), st.lists(st.tuples(st.sampled_from(FIELDS), cells)).map(
@@ -310,27 +257,20 @@ def test_any_packet_gives_a_sample(packet):
     assert math.isnan(sample.battery) or 0.0 <= sample.battery <= 1.0
 
 
-def flown(tmp_path, rows, header="stamp_s,vgx,vgy,vgz,pitch,roll,yaw"):
-    (tmp_path / "t.csv").write_text("\n".join([header, *rows]) + "\n")
-    return read_table(tmp_path / "t.csv").warnings("t.csv")
-
-
-def test_a_whole_file_is_read_without_a_word(tmp_path):
-    assert flown(tmp_path, [f"{0.1 * k:.1f},1,2,3,0,0,{k}" for k in range(5)]) == []
-
-
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        ([], "t.csv: holds no state message, so the run goes without telemetry"),
-        (["0.0,1,2,3,0,0,0", "torn", "0.1,1,2,3,0,0,0", "0.1,1,2,3,0,0,0"], "t.csv: 2 of 4 rows left out"),
-        (["0.0,,,,0,0,0", "0.1,,,,0,0,0"], "holds no velocity (vgx, vgy, vgz)"),
-        (["0.0,1,2,3,,,0", "0.1,1,2,3,,,0"], "holds no attitude (pitch, roll, yaw)"),
+        ([f"{0.1 * k:.1f},1,2,3,0,0,{k}" for k in range(5)], []),
+        ([], ["no state message"]),
+        (["0.0,1,2,3,0,0,0", "torn", "0.1,1,2,3,0,0,0", "0.1,1,2,3,0,0,0"], ["2 of 4 rows"]),
+        (["0.0,,,,0,0,0", "0.1,,,,0,0,0"], ["vgx, vgy, vgz"]),
+        (["0.0,1,2,3,,,0", "0.1,1,2,3,,,0"], ["pitch, roll, yaw"]),
     ],
 )
 def test_what_a_file_does_not_hold_is_said(tmp_path, rows, words):
-    (warning,) = flown(tmp_path, rows)
-    assert words in warning
+    path = write(tmp_path, "\n".join(["stamp_s,vgx,vgy,vgz,pitch,roll,yaw", *rows]) + "\n")
+    said = read_table(path).warnings("t.csv")
+    assert len(said) == len(words) and all(word in line for word, line in zip(words, said, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -361,11 +301,6 @@ def test_units_of_velocities_and_angles_are_those_of_the_header(tmp_path, unit, 
     assert np.isnan(sample.rpy_rad[2]) or sample.rpy_rad[2] == pytest.approx(-0.5)
 
 
-def test_a_unit_that_is_not_known_is_refused_by_name(tmp_path):
-    with pytest.raises(TelemetryError, match=r"tof \(furlong\).*cm"):
-        read_telemetry(write(tmp_path, "stamp_s,tof (furlong)\n0,1\n"))
-
-
 @pytest.mark.parametrize(
     ("times", "seconds"),
     [
@@ -388,30 +323,24 @@ def test_stamps_in_another_unit_than_their_name_are_reported(tmp_path):
     assert any("milliseconds" in warning for warning in said)
 
 
-def test_rows_without_a_readable_time_name_the_column(tmp_path):
-    with pytest.raises(TelemetryError, match="'stamp_s'.*noon"):
-        read_telemetry(write(tmp_path, "stamp_s,yaw\n" + "noon,1\n" * 160))
-
-
 def test_a_column_without_a_number_is_named(tmp_path):
     said = read_telemetry(write(tmp_path, "stamp_s,yaw,tof\n0,1,n/a\n0.1,1,n/a\n"))[1]
     assert any("'tof' holds no number" in warning for warning in said)
 
 
 @pytest.mark.parametrize(
-    ("head", "word"),
+    "head",
     [
-        (b"ULog\x01\x125\x01", "ulog2csv"),
-        (b"\xa3\x95\x80\x80", "mavlogdump"),
-        (b"FMT, 128, 89, FMT, BBnNZ, Type,Length\n", "XKF1"),
-        (b"1\n00:00:00,000 --> 00:00:00,033\n<font>HOME</font>\n", "SRT"),
-        (b"time(millisecond),datetime(utc),height_above_takeoff(feet),xSpeed(mph)\n0,1,2,3\n", "AirData"),
-        (b"latitude,longitude,altitude(m),velocityX(mps),pitchRaw\n1,2,3,4,5\n", "Litchi"),
+        b"ULog\x01\x125\x01",
+        b"\xa3\x95\x80\x80",
+        b"FMT, 128, 89, FMT, BBnNZ, Type,Length\n",
+        b"1\n00:00:00,000 --> 00:00:00,033\n<font>HOME</font>\n",
+        b"time(millisecond),datetime(utc),height_above_takeoff(feet),xSpeed(mph)\n0,1,2,3\n",
+        b"latitude,longitude,altitude(m),velocityX(mps),pitchRaw\n1,2,3,4,5\n",
     ],
 )
-def test_logs_of_other_programs_are_named_with_a_way_to_convert_them(tmp_path, head, word):
+def test_logs_of_other_programs_are_refused_with_a_way_to_convert_them(tmp_path, head):
     path = tmp_path / "flight.log"
     path.write_bytes(head)
-    with pytest.raises(TelemetryError, match=word) as caught:
+    with pytest.raises(TelemetryError, match="stamp_s"):
         read_telemetry(path)
-    assert "stamp_s" in str(caught.value)

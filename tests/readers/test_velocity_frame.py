@@ -60,29 +60,15 @@ def test_hover_and_missing_columns_say_nothing(rng):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("name", ["flight_a", "flight_b"])
-def test_real_tellos_report_world_velocities(data_dir, name):
-    table = read_table(data_dir / "tello_telemetry" / f"{name}.csv")
-    units = detect_units(table)
-    assert (units.velocity_m_s, units.z_down, units.body_frame) == (0.1, True, False)
-    assert body_frame_evidence(table.stamps_s, table.values)[0] < -15
-
-
-@pytest.mark.data
 @pytest.mark.parametrize("lean_deg", [0.0, -23.0])
 @pytest.mark.parametrize("name", ["flight_a", "flight_b"])
 def test_real_flights_in_body_or_leaning_axes_are_distinguished(data_dir, name, lean_deg):
     table = read_table(data_dir / "tello_telemetry" / f"{name}.csv")
-    values = {**table.values, "pitch": table.values["pitch"] + lean_deg}
-    assert body_frame_evidence(table.stamps_s, values)[0] < -15
-    assert body_frame_evidence(table.stamps_s, turned_to_body(values))[0] > 15
-
-
-@pytest.mark.data
-@pytest.mark.parametrize("name", ["flight_a", "flight_b"])
-def test_no_stretch_of_a_real_flight_is_taken_for_body_axes(data_dir, name):
-    table = read_table(data_dir / "tello_telemetry" / f"{name}.csv")
+    assert not detect_units(table).body_frame
     t = table.stamps_s - table.stamps_s[0]
-    for begin, length in [(b, s) for s in (60.0, 120.0) for b in np.arange(0.0, t[-1] - s, s / 3)]:
-        part = (t >= begin) & (t < begin + length)
+    values = {**table.values, "pitch": table.values["pitch"] + lean_deg}
+    assert body_frame_evidence(t, values)[0] < -15
+    assert body_frame_evidence(t, turned_to_body(values))[0] > 15
+    for begin in np.arange(0.0, t[-1] - 60.0, 20.0):  # no stretch looks like the other frame
+        part = (t >= begin) & (t < begin + 60.0)
         assert body_frame_evidence(t[part], {k: x[part] for k, x in table.values.items()})[0] <= 0.0

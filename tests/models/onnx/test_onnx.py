@@ -6,10 +6,9 @@ import onnxruntime
 import pytest
 import torch
 
-from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
 from edgeslam_torch.models.fastdepth import Variant
-from edgeslam_torch.models.onnx.export import ExportOptions, export_onnx, set_opset
+from edgeslam_torch.models.onnx.export import ExportOptions, export_onnx
 from edgeslam_torch.models.onnx.file import read_onnx
 from edgeslam_torch.models.onnx.fold import deployed, fold_batch_norm
 from edgeslam_torch.models.onnx.graph import build_graph
@@ -31,14 +30,17 @@ def random_network(metadata):
 METADATA = Metadata(variant=Variant.PRUNED.value, sigma_scale=1.5, sigma_floor=0.05)
 
 
-def run(model, image):
+def agrees(model, network, metadata, x):
+    with torch.no_grad():
+        expected = deployed(network, metadata)(x)
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    return session.run(["log_depth", "sigma_log"], {"image": image})
+    for ours, theirs in zip(session.run(["log_depth", "sigma_log"], {"image": x.numpy()}), expected, strict=True):
+        np.testing.assert_allclose(ours, theirs.numpy(), rtol=1e-4, atol=1e-4)
 
 
 def test_folding_batch_norm_changes_nothing():
     network = random_network(METADATA)
-    x = torch.randn(1, 3, 64, 64)
+    x = torch.randn(1, 3, 32, 32)
     torch.testing.assert_close(fold_batch_norm(network).predict(x), network.predict(x), rtol=1e-4, atol=1e-4)
     assert any(isinstance(m, torch.nn.BatchNorm2d) for m in network.modules()), "the original is untouched"
 
@@ -57,65 +59,28 @@ def test_own_graph_equals_torch(tmp_path, metadata):
     graph, record = build_graph(tmp_path / "w.safetensors")
     assert record == metadata
     for size in ((64, 96), (32, 32)):
-        x = torch.randn(1, 3, *size)
-        with torch.no_grad():
-            expected = deployed(network, metadata)(x)
-        for ours, theirs in zip(run(graph, x.numpy()), expected, strict=True):
-            np.testing.assert_allclose(ours, theirs.numpy(), rtol=1e-4, atol=1e-4)
+        agrees(graph, network, metadata, torch.randn(1, 3, *size))
     onnx.checker.check_model(onnx.load_from_string(graph), full_check=True)
 
 
 @pytest.mark.slow
-def test_exported_file_holds_opset_and_metadata_and_agrees(tmp_path):
+@pytest.mark.parametrize(
+    ("options", "sizes"),
+    [
+        ({"opset": 17}, [(64, 96)]),
+        ({"dynamic_size": True, "dynamic_batch": True}, [(64, 96), (96, 32)]),
+    ],
+)
+def test_exported_file_holds_the_record_and_agrees_with_torch(tmp_path, options, sizes):
     network = random_network(METADATA)
     path = tmp_path / "model.onnx"
-    export_onnx(network, METADATA, path, ExportOptions(64, 96, opset=17))
+    export_onnx(network, METADATA, path, ExportOptions(64, 96, **options))
     model = onnx.load(str(path))
-    assert [o.version for o in model.opset_import if o.domain == ""] == [17]
-    assert model.ir_version <= 9
+    if "opset" in options:  # for old runtimes
+        assert [o.version for o in model.opset_import if o.domain == ""] == [17] and model.ir_version <= 9
     assert read_onnx(path)[1] == METADATA
-    x = torch.randn(1, 3, 64, 96)
-    with torch.no_grad():
-        expected = deployed(network, METADATA)(x)
-    for ours, theirs in zip(run(str(path), x.numpy()), expected, strict=True):
-        np.testing.assert_allclose(ours, theirs.numpy(), rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_open_dimensions_take_any_batch_and_size(tmp_path):
-    network = random_network(METADATA)
-    path = tmp_path / "model.onnx"
-    export_onnx(network, METADATA, path, ExportOptions(64, 96, dynamic_size=True, dynamic_batch=True))
-    assert read_onnx(path)[1] == METADATA
-    for shape in ((1, 3, 64, 96), (3, 3, 96, 32)):
-        x = torch.randn(*shape)
-        with torch.no_grad():
-            expected = deployed(network, METADATA)(x)
-        for ours, theirs in zip(run(str(path), x.numpy()), expected, strict=True):
-            np.testing.assert_allclose(ours, theirs.numpy(), rtol=1e-4, atol=1e-4)
-
-
-def test_file_without_metadata_is_refused(tmp_path):
-    graph, _ = _plain_model()
-    onnx.save(graph, str(tmp_path / "x.onnx"))
-    with pytest.raises(WeightsError, match="no EdgeSLAM metadata"):
-        read_onnx(tmp_path / "x.onnx")
-
-
-def test_opset_conversion_sets_the_ir_for_old_runtimes():
-    model, _ = _plain_model()
-    assert set_opset(model, 16).ir_version == 9
-
-
-def _plain_model():
-    value = onnx.helper.make_tensor_value_info
-    graph = onnx.helper.make_graph(
-        [onnx.helper.make_node("Relu", ["x"], ["y"])],
-        "g",
-        [value("x", onnx.TensorProto.FLOAT, [1])],
-        [value("y", onnx.TensorProto.FLOAT, [1])],
-    )
-    return onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)]), "y"
+    for batch, size in enumerate(sizes, 1):
+        agrees(str(path), network, METADATA, torch.randn(batch, 3, *size))
 
 
 def doubling(size):

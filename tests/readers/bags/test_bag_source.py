@@ -120,20 +120,13 @@ def test_depth_maps_are_no_camera(tmp_path):
         open_source(only)
 
 
-def test_zero_header_stamps_are_replaced_by_receipt_and_said(tmp_path):
-    received = _times(5)
-    path = bags.write_mcap(tmp_path / "a.mcap", _pictures([0.0] * 5, received=received))
-    source = open_source(path)
-    assert _stamps(source) == pytest.approx(received, abs=1e-6)
-    assert "header stamps are zero" in _reasons(source)
-
-
-def test_header_stamps_that_run_backwards_are_replaced_by_receipt_and_said(tmp_path):
+@pytest.mark.parametrize(("sign", "words"), [(0.0, "are zero"), (-1.0, "run backwards")])
+def test_header_stamps_that_tell_no_time_are_replaced_by_receipt_and_said(tmp_path, sign, words):
     received = _times(9)
-    path = bags.write_mcap(tmp_path / "a.mcap", _pictures([2 * received[0] - t for t in received], received=received))
-    source = open_source(path)
+    headers = [abs(sign) * 2 * received[0] + sign * t for t in received]
+    source = open_source(bags.write_mcap(tmp_path / "a.mcap", _pictures(headers, received=received)))
     assert _stamps(source) == pytest.approx(received, abs=1e-6)
-    assert "header stamps run backwards" in _reasons(source)
+    assert words in _reasons(source)
 
 
 def test_one_wild_stamp_and_a_clock_that_is_set_back_cost_no_picture(tmp_path):
@@ -162,13 +155,6 @@ def test_telemetry_of_another_clock_is_moved_to_the_pictures(tmp_path):
     assert "500 s apart" in _reasons(source)
 
 
-def test_a_damaged_picture_costs_itself_only(tmp_path):
-    events = _pictures(_times(4))
-    events[2][3]["data"] = b"short"
-    source = open_source(bags.write_mcap(tmp_path / "a.mcap", events))
-    assert len(_stamps(source)) == 3 and "too few" in _reasons(source)
-
-
 @pytest.mark.parametrize("name", ["a.mcap", "a.bag"])
 @pytest.mark.parametrize("keep", [0, 5, 40, 0.5, 0.98])
 def test_a_truncated_file_is_refused_in_one_line_or_read_as_far_as_it_goes(tmp_path, name, keep):
@@ -180,18 +166,18 @@ def test_a_truncated_file_is_refused_in_one_line_or_read_as_far_as_it_goes(tmp_p
     assert str(path.name) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_wrong_topics_are_refused_with_a_suggestion(tmp_path):
+@pytest.mark.parametrize("topic", ["/cam/image_rw", "odometry=/cam/image_raw", "odom=/cam/image_raw"])
+def test_wrong_topics_are_refused(tmp_path, topic):
     path = bags.write_mcap(tmp_path / "a.mcap", _pictures(_times(2)))
-    with pytest.raises(SourceError, match="did you mean /cam/image_raw"):
-        open_source(path, topics=["/cam/image_rw"])
-    with pytest.raises(SourceError, match="no role 'odometry'"):
-        open_source(path, topics=["odometry=/cam/image_raw"])
-    with pytest.raises(SourceError, match="is not a odom topic"):
-        open_source(path, topics=["odom=/cam/image_raw"])
-    with pytest.raises(SourceError, match="--topic is for ROS bags"):
+    with pytest.raises(SourceError, match=topic.split("=")[0]):
+        open_source(path, topics=[topic])
+
+
+def test_topics_of_what_is_no_bag_and_bags_without_pictures_are_refused(tmp_path):
+    with pytest.raises(SourceError, match="--topic"):
         open_source(_any_camera(tmp_path), topics=["/x"])
     nothing = bags.write_mcap(tmp_path / "b.mcap", [("/chat", "std_msgs/msg/String", 1.0, {"data": "hi"})])
-    with pytest.raises(SourceError, match="no pictures in it"):
+    with pytest.raises(SourceError, match="no pictures"):
         open_source(nothing)
 
 
