@@ -1,9 +1,7 @@
 """``edgeslam data get`` from a publisher on this machine."""
 
 import hashlib
-import io
 import json
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -145,20 +143,6 @@ def test_wrong_checksum_leaves_nothing(one, tmp_path, capsys, algorithm):
     assert list((tmp_path / "rec" / ".downloads").iterdir()) == []
 
 
-def test_truncated_file_of_known_size_is_not_taken(one, tmp_path, capsys):
-    content = tum()
-    one(content[:-10], bytes=len(content))
-    assert get(tmp_path, "tum_fr1_a") == 1
-    assert f"has {len(content) - 10} bytes instead of {len(content)}" in capsys.readouterr().err
-
-
-def test_larger_file_than_stated_is_not_fetched(one, tmp_path, capsys):
-    content = tum()
-    one(content, bytes=len(content) - 1)
-    assert get(tmp_path, "tum_fr1_a") == 1
-    assert f"the server offers {len(content)} bytes" in capsys.readouterr().err
-
-
 def test_missing_file_is_named_with_a_way_out_and_the_next_address_is_tried(one, publisher, tmp_path, capsys):
     one(tum(), urls=[f"{publisher.address}/gone.tgz"])
     assert get(tmp_path, "tum_fr1_a") == 1
@@ -201,15 +185,6 @@ def test_archive_by_hand_is_checked_and_kept(one, tmp_path, capsys):
     assert get(tmp_path, "tum_fr1_a", "--archive", str(archive)) == 1
     assert "expected" in capsys.readouterr().err
     assert get(tmp_path, "tum_fr1_a", "--archive", str(tmp_path / "nowhere.tgz")) == 1
-
-
-def test_hostile_archive_leaves_nothing(one, tmp_path, capsys):
-    one(tgz({"rgbd_dataset_freiburg1_xyz/rgb.txt": b"1 a.png\n", "../../../evil": b"x"}))
-    assert get(tmp_path, "tum_fr1_a") == 1
-    assert "would lie outside" in capsys.readouterr().err
-    assert not (tmp_path / "rec" / "tum_fr1_a").exists()
-    assert not list(tmp_path.rglob("evil"))
-    assert not list(tmp_path.rglob("*.unpacking"))
 
 
 def test_two_recordings_of_one_archive_are_one_download(shop, publisher, tmp_path):
@@ -278,32 +253,6 @@ def test_licence_is_asked_for(one, publisher, tmp_path, monkeypatch, answer, cod
     assert bool(publisher.requests) == (code == 0)
 
 
-def test_script_without_consent_fetches_nothing(one, publisher, tmp_path, monkeypatch, capsys):
-    one(tum())
-    monkeypatch.setattr(consent.sys, "stdin", io.StringIO())
-    assert main(["data", "get", "tum_fr1_a", "--to", str(tmp_path / "rec")]) == 1
-    assert "give --agree" in capsys.readouterr().err
-    assert publisher.requests == []
-
-
-def test_missing_pooch_is_named_with_its_extra(one, tmp_path, monkeypatch, capsys):
-    one(tum())
-    monkeypatch.setitem(sys.modules, "pooch", None)
-    assert get(tmp_path, "tum_fr1_a") == 1
-    assert "pip install 'edgeslam-torch[data]'" in capsys.readouterr().err
-
-
-def test_list_says_what_is_there(one, tmp_path, capsys):
-    one(tum(), bytes=450_000_000, doubt="it moved")
-    assert main(["data", "list", "--to", str(tmp_path / "rec")]) == 0
-    said = capsys.readouterr().out
-    assert "tum_fr1_a: 0.45 GB, no checksum known, address in doubt: it moved\n" in said
-    (tmp_path / "rec" / "tum_fr1_a").mkdir(parents=True)
-    (tmp_path / "rec" / "tum_fr1_a" / ".origin.json").touch()
-    main(["data", "list", "tum_*", "--to", str(tmp_path / "rec")])
-    assert "is there" in capsys.readouterr().out
-
-
 def test_benchmark_runs_on_what_it_fetched(one, tmp_path, monkeypatch):
     one(tum(40))
     seen = {}
@@ -317,3 +266,11 @@ def test_benchmark_runs_on_what_it_fetched(one, tmp_path, monkeypatch):
     assert main(words) == 130
     assert seen["only"] == ("tum_fr1_a",)
     assert seen["found"] == {"tum_fr1_a": tmp_path / "rec" / "tum_fr1_a"}
+
+
+@pytest.mark.parametrize("missing", [-1, 1])
+def test_a_file_of_another_size_than_stated_is_not_taken(one, tmp_path, capsys, missing):
+    content = tum()
+    one(content, bytes=len(content) + missing)
+    assert get(tmp_path, "tum_fr1_a") == 1
+    assert not (tmp_path / "rec" / "tum_fr1_a").exists()

@@ -52,13 +52,6 @@ def test_icl_points_fall_on_the_pixels_that_its_own_camera_states(rng, tmp_path)
     assert dataset.depth.metres_per_unit == pytest.approx(1 / 5000)
 
 
-def test_icl_frames_are_in_the_order_of_their_numbers(rng, tmp_path):
-    write_icl(tmp_path, [pose(rng) for _ in range(12)])
-    prepare_icl(tmp_path, None)
-    names = [row.split()[1] for row in (tmp_path / "rgb.txt").read_text().splitlines()[1:]]
-    assert names == [f"rgb/{i}.png" for i in range(13)], "not 0, 1, 10, 11, 12, 2"
-
-
 def test_tartanair_camera_looks_along_the_first_axis_of_its_poses(tmp_path):
     for i in range(3):
         (tmp_path / f"{i:06d}.png").write_bytes(png(i))
@@ -80,8 +73,3 @@ def test_truth_that_does_not_fit_is_refused(tmp_path, truth):
         (tmp_path / f"{i:06d}.png").write_bytes(png(i))
     with pytest.raises(SourceError):
         prepare_tartanair(tmp_path, truth)
-
-
-def test_icl_without_its_truth_is_refused(tmp_path):
-    with pytest.raises(SourceError, match=r"has 0 files \*.gt.freiburg"):
-        prepare_icl(tmp_path, None)

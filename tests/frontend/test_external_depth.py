@@ -13,7 +13,7 @@ from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.frontend import depth_network
 from edgeslam_torch.frontend.depth_check import CheckedDepth
 from edgeslam_torch.frontend.depth_network import open_depth, weights_path
-from edgeslam_torch.frontend.external_depth import ExternalDepth, relative_depth
+from edgeslam_torch.frontend.external_depth import ExternalDepth
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
 from edgeslam_torch.models.record import weights_file
@@ -53,13 +53,6 @@ def test_every_output_type_gives_metres(tmp_path, image, gives, plane):
     np.testing.assert_allclose(found.depth_m[:, :80], 2 * NEAR_M, rtol=1e-5)  # a lens of twice the focal length
     np.testing.assert_allclose(found.depth_m[:, 112:], 2 * FAR_M, rtol=1e-5)
     np.testing.assert_allclose(found.sigma_log, 0.25)
-
-
-def test_a_network_for_any_camera_is_not_rescaled(tmp_path, image):
-    network = open_depth(describe(green_network(tmp_path / "net.onnx"), f'gives = "metres"\nsigma_log = 0.1\n{SIZE}'))
-    found = network(image, CAMERA)
-    np.testing.assert_allclose(found.depth_m[:, :80], NEAR_M, rtol=1e-5)
-    np.testing.assert_allclose(found.sigma_log, 0.1)
 
 
 def test_sigma_is_the_networks_own_where_it_states_one(tmp_path, image):
@@ -168,12 +161,6 @@ def test_non_finite_pixels_are_unknown(tmp_path, image):
     np.testing.assert_allclose(found.depth_m[:, 112:], FAR_M - 2.0, rtol=1e-4)
 
 
-def test_constant_output_gives_no_relative_depth():
-    assert np.isnan(relative_depth(np.full((4, 4), 3.0, np.float32))).all()
-    assert np.isnan(relative_depth(np.full((4, 4), np.nan, np.float32))).all()
-    assert np.isnan(relative_depth(np.zeros((4, 4), np.float32))).all()
-
-
 # -- presets -------------------------------------------------------------------------------------------------------
 
 SIGNATURES = {
@@ -201,11 +188,6 @@ def test_preset_runs_a_graph_of_its_networks_signature(tmp_path, monkeypatch, na
     assert isinstance(network, ExternalDepth) and network.is_metric == ("metres" in PRESETS[name].remote.about)
     found = network(image, CAMERA)
     assert found.depth_m[:, 112:].mean() > 1.5 * found.depth_m[:, :80].mean() > 0
-
-
-def test_a_preset_can_be_corrected(tmp_path, image):
-    path = describe(green_network(tmp_path / "n.onnx"), 'preset = "metric3d-v2-small"\ndepth = ""\nmultiple = 14\n')
-    assert open_depth(path).network.multiple == 14
 
 
 def test_weights_that_come_with_the_package_have_names(image):
@@ -251,18 +233,6 @@ def test_input_has_the_graphs_data_type_and_layout(tmp_path, image, numbers, siz
     np.testing.assert_allclose(found.depth_m[:, 112:], FAR_M, rtol=1e-3)
 
 
-def test_input_of_any_size_gets_a_default_with_a_remark(tmp_path, caplog):
-    network = open_depth(describe(green_network(tmp_path / "net.onnx"), 'gives = "metres"\nmultiple = 14\n'))
-    assert network.network.input_height == network.network.input_width == 518
-    assert "say input_height and input_width" in caplog.text
-
-
-def test_the_first_of_several_outputs_is_used_with_a_remark(tmp_path, caplog):
-    path = green_network(tmp_path / "net.onnx", [node("Log", "depth", "log")], "depth log")
-    open_depth(describe(path, f'gives = "metres"\n{SIZE}'))
-    assert "say depth" in caplog.text
-
-
 def test_only_external_data_beside_the_file_is_read(tmp_path, image):
     whole = onnx.load(green_network(tmp_path / "whole.onnx"))
     path = tmp_path / "net.onnx"
@@ -278,15 +248,3 @@ def test_only_external_data_beside_the_file_is_read(tmp_path, image):
     path.write_bytes(model.SerializeToString())
     with pytest.raises(WeightsError, match="save the network as one file"):
         open_depth(path)
-
-
-@pytest.mark.parametrize(
-    "record",
-    ['{"gives": ["metres"]}', '{"gives": "metres", "preset": []}', '{"gives": "metres", "mean": [[1], 2, 3]}', "[[[["],
-)
-def test_record_of_odd_types_is_one_line(tmp_path, record):
-    model = onnx.load(green_network(tmp_path / "net.onnx"))
-    model.metadata_props.add(key="edgeslam.depth", value=record)
-    onnx.save(model, tmp_path / "net.onnx")
-    with pytest.raises(WeightsError):
-        open_depth(tmp_path / "net.onnx")

@@ -20,13 +20,6 @@ def test_keypoints_lie_within_each_radius(rng, count):
     assert len(i) == near.sum()
 
 
-def test_nothing_is_near_nothing():
-    grid = KeypointGrid(np.zeros((0, 2), np.float32))
-    assert len(grid) == 0
-    assert [len(side) for side in grid.near(np.zeros((5, 2)), np.ones(5))] == [0, 0]
-    assert [len(side) for side in KeypointGrid(np.ones((3, 2))).near(np.zeros((0, 2)), np.ones(0))] == [0, 0]
-
-
 @pytest.mark.parametrize("count", [1, 4])
 def test_the_nearest_pixels_are_a_trees(rng, count):
     uv, query = np.float32(rng.uniform(0, 300, (60, 2))), rng.uniform(-50, 350, (70, 2))

@@ -2,20 +2,11 @@
 
 import cv2
 import numpy as np
-import pytest
 from rendered import CAMERA, patchwork, views
 
 from edgeslam_torch.config import OrbConfig
 from edgeslam_torch.frontend.orb import OrbExtractor, spread
 from edgeslam_torch.geometry.camera import PRESETS
-
-
-@pytest.mark.parametrize("grey", [0, 128, 255])
-def test_constant_image_has_no_keypoints(grey):
-    features = OrbExtractor(OrbConfig(), CAMERA)(np.full((240, 320), grey, np.uint8))
-    assert features.uv.shape == (0, 2)
-    assert features.descriptors.shape == (0, 32)
-    assert len(features.octave) == len(features.angle_rad) == 0
 
 
 def test_keypoints_are_described_and_inside():
@@ -104,21 +95,3 @@ def test_spread_keeps_the_few_corners_of_a_weakly_textured_region(rng):
     assert len(keep) == 500
     assert (np.diff(keep) > 0).all()
     assert (keep >= 2000).sum() == 12
-
-
-def test_spread_takes_the_strongest_of_a_cell():
-    uv = np.tile([[10.0, 10.0]], (9, 1)).astype(np.float32)
-    assert spread(uv, np.arange(9.0), 640, 480, 3).tolist() == [6, 7, 8]
-
-
-def test_spread_of_few_keeps_all():
-    assert spread(np.zeros((3, 2)), np.ones(3), 640, 480, 5).tolist() == [0, 1, 2]
-
-
-def test_spread_is_as_even_as_the_corners_allow(rng):
-    """Evenly detected corners: no quarter of the image gets more than a third of what is kept."""
-    uv = rng.uniform([0, 0], [640, 480], (3000, 2)).astype(np.float32)
-    score = 100.0 - uv[:, 0] / 10  # the left is stronger throughout
-    keep = spread(uv, score, 640, 480, 600)
-    quarter = (uv[keep] // [320, 240]) @ [1, 2]
-    assert np.bincount(quarter.astype(int), minlength=4).max() < 200

@@ -68,9 +68,3 @@ def test_a_static_image_is_recognised_after_encoding(rng, tmp_path):
     found, warning = seen(images)
     assert np.mean(found) > 0.9
     assert "froze" in warning
-
-
-def test_several_stretches_give_one_warning(rng):
-    still, other = room(rng), room(rng)
-    _, warning = seen([still] * 30 + [other] * 45)
-    assert "froze 2 times, the longest from 101.0 to 102.5 s" in warning

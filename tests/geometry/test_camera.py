@@ -11,10 +11,6 @@ from edgeslam_torch.geometry.mount import camera_on_body
 CAMERA = Camera(640, 480, 500.0, 510.0, 320.0, 240.0)
 
 
-def test_projection_worked_by_hand():
-    np.testing.assert_allclose(CAMERA.project(np.array([[0.4, -0.2, 2.0]])), [[420.0, 189.0]])
-
-
 def test_back_projection_undoes_projection(rng):
     p_c = rng.uniform([-1, -1, 0.5], [1, 1, 6], (50, 3))
     np.testing.assert_allclose(CAMERA.back_project(CAMERA.project(p_c), p_c[:, 2]), p_c, atol=1e-12)

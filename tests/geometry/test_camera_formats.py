@@ -1,13 +1,15 @@
 """The same numbers in the files of many programs are the same camera; what is not understood is refused or said."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from edgeslam_torch.errors import CalibrationError
-from edgeslam_torch.geometry.camera_file import read_camera
+from edgeslam_torch.geometry.camera import PRESETS
+from edgeslam_torch.geometry.camera_file import load_camera, read_camera, save_camera
 
 SIZE = (752, 480)
 FX, FY, CX, CY = 458.654, 457.296, 367.215, 248.375
@@ -113,6 +115,13 @@ def _read(folder, content, name="c.yaml", size=SIZE):
     return read_camera(path, size)
 
 
+def test_our_own_file_round_trips(tmp_path):
+    camera = replace(PRESETS["tum_fr1"], focal_sigma=0.12)
+    save_camera(tmp_path / "camera.yaml", camera)
+    back = load_camera(tmp_path / "camera.yaml")
+    assert replace(back, source=camera.source) == camera
+
+
 @pytest.mark.parametrize("name", FORMATS)
 def test_the_same_numbers_are_the_same_camera(tmp_path, name):
     camera, remarks = _read(tmp_path, FORMATS[name])
@@ -177,10 +186,6 @@ def test_a_lens_without_numbers_gets_a_line(tmp_path, lens):
     assert any("no distortion coefficients" in remark for remark in remarks)
 
 
-def test_unknown_keys_are_named(tmp_path):
-    assert any("exposure" in remark for remark in _read(tmp_path, OWN + "exposure: 3\n")[1])
-
-
 WIDE = OWN.replace("458.654", "200.0").replace("457.296", "200.0")
 LAUGHS = "<!DOCTYPE l [<!ENTITY a 'ha'>]>"
 
@@ -214,6 +219,14 @@ LAUGHS = "<!DOCTYPE l [<!ENTITY a 'ha'>]>"
         OWN + "focal: 460\n",
         OWN + "focal_sigma: 1e308\n",
         OWN + "focal_sigma: high\n",
+        OWN + "focal_sigma: -0.1\n",
+        OWN + "distortion: [1.0e+300, 0, 0, 0, 0]\n",
+        OWN + "a: &a [x]\ndistortion_model: *a\n",
+        OWN.replace(f"fx: {FX}", "fx: 3.6"),
+        OWN.replace(f"fx: {FX}", "fx: .nan"),
+        OWN.replace(f"fy: {FY}\n", ""),
+        "",
+        "just words",
         OWN + "binning_x: 2\n",
         OWN.replace("752", "752.5"),
         OWN.replace("752", "-752"),
@@ -238,11 +251,3 @@ def test_unsupported_content_is_rejected_in_one_line(tmp_path, text):
         _read(tmp_path, text)
     assert "\n" not in str(raised.value)
     assert len(str(raised.value)) < 500 + len(str(tmp_path))
-
-
-def test_a_huge_file_is_not_read(tmp_path):
-    path = tmp_path / "camera.yaml"
-    with path.open("wb") as file:
-        file.truncate(200_000_000)
-    with pytest.raises(CalibrationError, match="200 MB"):
-        read_camera(path)

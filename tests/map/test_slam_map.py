@@ -165,14 +165,6 @@ def test_a_keyframe_belongs_to_the_submap_in_which_it_was_tracked(rng):
     assert [points.map.piece_of(k.id) for k in points.keyframes] == [0, 0, 0]
 
 
-def test_the_number_of_an_empty_submap_is_reused(rng):
-    points = PointMap(rng, 300, 2)
-    for begun in ("dark", "still dark"):
-        points.map.begin_piece(begun)
-        points.map.add_keyframe(points.keyframes[points.map.piece])
-    assert points.map.piece == 0
-
-
 def test_frames_of_a_removed_keyframe_stay_in_their_submap(rng):
     """The keyframe next in time is of another piece, which may move without this one."""
     points = PointMap(rng, 300, 3)

@@ -119,19 +119,3 @@ def test_alignment_does_not_jump_by_a_period_of_the_texture(seen):
     align(slam_map, second, CAMERA)
     went = np.abs(second.features.uv[far] - moved).max(1) / SCALE ** second.features.octave[far]
     assert went.max() < 1.5
-
-
-def test_without_an_image_nothing_is_aligned(seen):
-    slam_map, (first, second, _) = seen
-    second.grey = None
-    before = second.features.uv.copy()
-    assert align(slam_map, second, CAMERA) == 0 and np.array_equal(second.features.uv, before)
-    second.grey, first.grey = first.grey, None
-    assert align(slam_map, second, CAMERA) == 0
-    assert np.array_equal(second.features.uv, before) and np.isnan(second.aligned_px).all()
-
-
-def test_anchors_behind_a_view_are_not_aligned(seen):
-    slam_map, (first, second, third) = seen
-    slam_map.anchors.p_w[first.anchor] -= 10.0 * first.T_w_c[:3, 2]
-    assert align(slam_map, second, CAMERA) == align(slam_map, third, CAMERA) == 0

@@ -7,6 +7,13 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.trajectory import TrajectoryLog
 
 
+def forward(x):
+    """Pose of a camera that went ``x`` along its own x axis."""
+    T = np.eye(4)
+    T[0, 3] = -x
+    return T
+
+
 def test_frames_follow_their_keyframe_even_after_its_removal(rng):
     """Refinement moves the heir of a removed keyframe by M: the frames tied to either follow rigidly."""
     points = PointMap(rng, 200, 3)
@@ -52,11 +59,6 @@ def test_frames_follow_the_next_keyframe_where_refinement_moved_it(rng):
     a, b = points.keyframes
     a.T_c_w = np.eye(4)
 
-    def forward(x):
-        T = np.eye(4)
-        T[0, 3] = -x
-        return T
-
     log = TrajectoryLog(points.map)
     log.append(0, 0.0, a.id, a.T_c_w, True, np.eye(4))
     for i, x in enumerate((0.2, 0.4, 0.6), 1):
@@ -75,11 +77,6 @@ def test_frames_of_the_first_map_are_corrected_too(rng):
     points = PointMap(rng, 200, 3)
     points.fill()
     first, second, third = points.keyframes
-
-    def forward(x):
-        T = np.eye(4)
-        T[0, 3] = -x
-        return T
 
     first.T_c_w, second.T_c_w = forward(0.0), forward(0.4)
     log = TrajectoryLog(points.map)
