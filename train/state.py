@@ -51,7 +51,7 @@ class TrainConfig:
     checkpoint_every: int = 250
     patience: int = 0
     """Validations without improvement before stopping; 0 never stops early."""
-    amp: bool | None = False
+    amp: bool | None = None
     """Autocast: bfloat16, on GPUs without it float16 with scaled gradients; None: on CUDA alone."""
     channels_last: bool = True
     device: str = "cpu"

@@ -21,46 +21,12 @@ from edgeslam_torch.eval.judge.thresholds import Row
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.record_files import read_mapping
 
-RUNS: dict[str, int] = CASES["release"]
+RUNS: dict[str, int] = CASES["release"]["cells"]
 """Cells with their number of seeds."""
-
-COMMANDS = {
-    "demo": "edgeslam demo --out runs/demo",
-    "calibrate": "edgeslam calibrate recordings/tello_calibration --board 8x6 --out tello.yaml",
-    "run": "edgeslam run recordings/tum_fr1_xyz --out runs/fr1",
-    "evaluate": "edgeslam eval runs/fr1 -g recordings/tum_fr1_xyz",
-    "occupancy": "edgeslam export-map runs/demo --format occupancy --out grid",
-    "plan": "edgeslam fly goto 3 0 --drone sim://l_corridor:3",
-    "fly": "edgeslam fly goto 3 0 --drone sim://l_corridor:3 --fly --record flights/1",
-    "replay": "edgeslam fly replay flights/1",
-    "finetune": "edgeslam finetune recordings/7scenes_redkitchen --steps 40 --out tuned",
-    "export": "edgeslam export --depth tuned/weights.safetensors --out model.onnx --int8 "
-    "--calibrate recordings/tum_fr1_xyz",
-    "fleet": "edgeslam demo --record-only --flights 3 --world corridor --duration 2 --rate 15 --width 320 --out fleet",
-    "batch": "edgeslam batch fleet --out batch",
-}
+FIGURES: dict[str, int] = CASES["release"]["figures"]
+"""What is kept of a run, with decimals."""
+COMMANDS: dict[str, str] = CASES["release"]["commands"]
 """Commands whose output the documents show, in this order: later ones use what earlier ones wrote."""
-
-FIGURES = {
-    "frames": 0,
-    "supported_end": 4,
-    "supported_live": 4,
-    "ate_m": 4,
-    "se3_m": 4,
-    "online_m": 4,
-    "path_m": 1,
-    "scale_sim3": 4,
-    "scale": 4,
-    "scale_sigma": 4,
-    "map_points": 0,
-    "map_median_m": 4,
-    "map_within_5cm": 3,
-    "cpu_ms": 1,
-    "orb_ms": 2,
-    "cpu_orb": 2,
-    "memory_mb": 0,
-}
-"""What is kept of a run, with decimals; names as in the judge's record."""
 
 
 def release_cells(data: Path | None) -> list[Cell]:

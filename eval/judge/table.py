@@ -6,7 +6,7 @@ from typing import Any
 from edgeslam_torch.eval.experiment.figures import grouped
 from edgeslam_torch.eval.experiment.tables import markdown_table
 from edgeslam_torch.eval.judge.score import COLUMNS
-from edgeslam_torch.eval.judge.thresholds import Row, Threshold, verdicts_of_cell, verdicts_of_groups
+from edgeslam_torch.eval.judge.thresholds import Row, Threshold, verdicts
 
 _FOOTNOTES = (
     "end, live: share of the frames whose pose rests on the map, at the end and when they came. path: ATE in % of the "
@@ -51,11 +51,9 @@ def _passed(name: str, rows: Sequence[Row], thresholds: Sequence[Threshold]) -> 
     errors = [row["error"] for row in own if row["error"]]
     if errors:
         return f"FAIL {len(errors)} of {len(own)} runs"
-    verdicts = verdicts_of_cell(name, rows, thresholds)
-    passed = sum(v.ok for v in verdicts)
-    if not verdicts:
-        return "-"
-    return "pass" if passed == len(verdicts) else f"FAIL {len(verdicts) - passed} of {len(verdicts)}"
+    found = verdicts(rows, thresholds, name)
+    failed = sum(not v.ok for v in found)
+    return (f"FAIL {failed} of {len(found)}" if failed else "pass") if found else "-"
 
 
 def _outcome(lines: Sequence[Sequence[str]], rows: Sequence[Row], thresholds: Sequence[Threshold]) -> list[str]:
@@ -64,9 +62,9 @@ def _outcome(lines: Sequence[Sequence[str]], rows: Sequence[Row], thresholds: Se
     out = [f"{outcomes.count('pass')} of {len(outcomes)} cells with thresholds pass."]
     out += [f"- {_run_name(row)}: no result: {row['error']}" for row in rows if row["error"]]
     for name, *_ in lines:
-        failed = [str(v) for v in verdicts_of_cell(name, rows, thresholds) if not v.ok]
+        failed = [str(v) for v in verdicts(rows, thresholds, name) if not v.ok]
         out += [f"- {name}: {'; '.join(failed)}"] if failed else []
-    for v in verdicts_of_groups(rows, thresholds):
+    for v in verdicts(rows, thresholds):
         word, cells = "pass" if v.ok else "FAIL", ", ".join(v.threshold.cells)
         out.append(f"- {cells}: {v.threshold} in {v.threshold.share:.0%}: {v.passed} of {v.runs}, {word}")
     return out

@@ -12,7 +12,7 @@ import numpy as np
 from edgeslam_torch.eval.errors import EvaluationError
 
 THRESHOLDS = Path(__file__).with_name("thresholds.toml")
-_LIMITS = ("at_least", "at_most", "at_most_times_base")
+_SIGNS = {"at_least": ">=", "at_most": "<=", "at_most_times_base": "<="}
 
 Row = dict[str, Any]
 
@@ -34,22 +34,9 @@ class Threshold:
         """Whether a cell's name matches."""
         return any(fnmatchcase(cell, pattern) for pattern in self.cells)
 
-    def passes(self, value: float | None, base: float | None = None) -> bool:
-        """Whether a run's figure is within the limit; one that it does not have is not.
-
-        Args:
-            value: The figure.
-            base: Its median over the runs of the cell that the run's is a variant of; None when there is none.
-        """
-        if value is None or (self.kind == "at_most_times_base" and base is None):
-            return False
-        limit = self.limit * base if base is not None and self.kind == "at_most_times_base" else self.limit
-        return value >= limit if self.kind == "at_least" else value <= limit
-
     def __str__(self) -> str:
-        sign = ">=" if self.kind == "at_least" else "<="
         times = " x base" if self.kind == "at_most_times_base" else ""
-        return f"{self.figure} {sign} {self.limit:g}{times}"
+        return f"{self.figure} {_SIGNS[self.kind]} {self.limit:g}{times}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,45 +69,41 @@ def read_thresholds(path: Path = THRESHOLDS) -> list[Threshold]:
         tables = tomllib.loads(path.read_text(encoding="utf-8")).get("threshold", [])
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise EvaluationError(f"{path}: cannot be read as thresholds ({error})") from error
-    return [
-        _threshold(tuple(table.get("cells", ())), figure, limit, path)
-        for table in tables
-        for figure, limit in table.items()
-        if figure != "cells"
-    ]
+    found = []
+    for table in tables:
+        cells = tuple(table.pop("cells", ()))
+        for figure, limit in table.items():
+            kinds = [kind for kind in _SIGNS if isinstance(limit, dict) and kind in limit]
+            if not cells or len(kinds) != 1 or set(limit) - {*kinds, "share"}:
+                raise EvaluationError(f"{path}: {figure} needs cells, and one of {', '.join(_SIGNS)}; got {limit!r}")
+            found.append(Threshold(cells, figure, kinds[0], float(limit[kinds[0]]), float(limit.get("share", 1.0))))
+    return found
 
 
-def _threshold(cells: tuple[str, ...], figure: str, limit: Any, path: Path) -> Threshold:
-    kinds = [k for k in _LIMITS if isinstance(limit, dict) and k in limit]
-    if not cells or len(kinds) != 1 or set(limit) - {*kinds, "share"}:
-        raise EvaluationError(f"{path}: {figure} needs cells, and one of {', '.join(_LIMITS)}; got {limit!r}")
-    return Threshold(cells, figure, kinds[0], float(limit[kinds[0]]), float(limit.get("share", 1.0)))
-
-
-def verdicts_of_cell(cell: str, rows: Sequence[Row], thresholds: Iterable[Threshold]) -> list[Verdict]:
-    """Verdicts of one cell on thresholds that every run must pass."""
-    own = [row for row in rows if row["cell"] == cell]
-    found = [_verdict(t, own, rows) for t in thresholds if t.share == 1.0 and t.covers(cell)]
-    return [verdict for verdict in found if verdict.runs]
-
-
-def verdicts_of_groups(rows: Sequence[Row], thresholds: Iterable[Threshold]) -> list[Verdict]:
-    """Verdicts of all runs on thresholds that only a share of them must pass."""
-    found = [_verdict(t, [row for row in rows if t.covers(row["cell"])], rows) for t in thresholds if t.share < 1.0]
+def verdicts(rows: Sequence[Row], thresholds: Iterable[Threshold], cell: str | None = None) -> list[Verdict]:
+    """Verdicts of one cell on the thresholds that every run must pass; without a cell, of all runs on those that only a
+    share of them must pass."""
+    found = []
+    for threshold in (t for t in thresholds if (t.share == 1.0) == (cell is not None)):
+        covered = [row for row in rows if threshold.covers(row["cell"]) and cell in (None, row["cell"])]
+        found.append(_verdict(threshold, covered, rows))
     return [verdict for verdict in found if verdict.runs]
 
 
 def _verdict(threshold: Threshold, covered: Sequence[Row], rows: Sequence[Row]) -> Verdict:
-    pairs = [(row["figures"].get(threshold.figure), _base(row, threshold.figure, rows)) for row in covered]
-    if threshold.kind == "at_most_times_base":  # without its base a variant cannot be judged
-        pairs = [(value, base) for value, base in pairs if base is not None]
-    known = [value for value, _ in pairs if value is not None]
-    worst = min(known, default=None) if threshold.kind == "at_least" else max(known, default=None)
-    passed = sum(threshold.passes(*pair) for pair in pairs)
-    return Verdict(threshold, passed, len(pairs), worst if len(known) == len(pairs) else None)
+    """Figures against their limits; a missing figure fails, and a variant without its base is not judged."""
+    pairs = [(row["figures"].get(threshold.figure), threshold.limit) for row in covered]
+    if threshold.kind == "at_most_times_base":
+        bases = [_base(row, threshold.figure, rows) for row in covered]
+        pairs = [(v, limit * base) for (v, limit), base in zip(pairs, bases, strict=True) if base is not None]
+    sign = -1.0 if threshold.kind == "at_least" else 1.0
+    known = [(value, sign * value <= sign * limit) for value, limit in pairs if value is not None]
+    worst = max((value for value, _ in known), key=lambda v: sign * v, default=None)
+    return Verdict(threshold, sum(ok for _, ok in known), len(pairs), worst if len(known) == len(pairs) else None)
 
 
 def _base(row: Row, figure: str, rows: Sequence[Row]) -> float | None:
+    """Median of a figure over the runs of the cell that the row's is a variant of."""
     values = [r["figures"].get(figure) for r in rows if r["cell"] == row["base"] and r["cell"] != row["cell"]]
     known = [v for v in values if v is not None]
     return float(np.median(known)) if known else None

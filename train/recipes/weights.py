@@ -1,25 +1,20 @@
 """The shipped weights: ``python -m edgeslam_torch.train.recipes.weights default|near --data DIR --out DIR``.
 
-``default``: 1. encoder from ImageNet; recordings and rendered rooms mixed, at a constant rate; 2. fewer rendered rooms
-and gentler augmentation, the rate falling to nothing; 3. uncertainty calibrated on views of rooms held out from both.
-
-``near``: 1. go on from given weights with rendered corridors, halls, sites and views from near, beside recordings;
-2. the mean of the weights before and after, which often does better on places of neither than both ends do (Wortsman
-et al., CVPR 2022).
-
-No recording that figures are quoted of is used; the last weights are kept, not the best on the curve.
+``default.toml`` and ``near.toml`` say what is learnt from, in which phases. No recording that figures are quoted of is
+used; the last weights are kept, not the best on the curve.
 """
 
 import argparse
 import logging
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Literal
 
-import numpy as np
 import torch
 
-from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.errors import ConfigError, WeightsError
+from edgeslam_torch.files.config_file import laid_over
+from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.device import DEVICES
 from edgeslam_torch.models.imagenet import load_imagenet_encoder
@@ -28,7 +23,7 @@ from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
 from edgeslam_torch.train.callbacks import ProgressBar
 from edgeslam_torch.train.loop import FINAL, train
-from edgeslam_torch.train.recipes.rendered_views import Drawn, place_views, render_files, room_views, stored_views
+from edgeslam_torch.train.recipes.rendered_views import place_views, render_files, room_views, stored_views
 from edgeslam_torch.train.signals import Source, Supervised, SupervisedWeights
 from edgeslam_torch.train.state import TrainConfig
 from edgeslam_torch.train.validate import score
@@ -37,178 +32,119 @@ from edgeslam_torch.train.views.datasets import load_depth_folder
 
 logger = logging.getLogger(__name__)
 
-IMAGENET = "mobilenet_v1_imagenet/mobilenet_v1_1.0_224_quant_embedding_extractor.tflite"
-INPUT_SIZE = (160, 224)
-"""Height and width [px]; a third faster than 192x256 and as accurate (model card)."""
 RENDERED = "rendered"
-NUMBER_OF_ROOMS, NUMBER_OF_PLACES = 350, 300
+"""Among the names of what a phase draws from; the others are recordings."""
 HELD_OUT_VIEWS = 150
 """First rendered views, of whole places, kept out of training for the curve and the calibration."""
-MEAN_SHARE = 0.5
-"""Of the weights after, in the mean."""
-LICENCE = (
-    "Apache-2.0; encoder initialised from google-coral's MobileNetV1 (Apache-2.0); trained on TUM RGB-D freiburg1_rpy "
-    "(CC BY 4.0, Sturm et al. 2012), ICL-NUIM living room 1 (CC BY 3.0, Handa et al. 2014) and rooms rendered by "
-    "this project"
-)
 
 
 @dataclass(frozen=True, slots=True)
 class Phase:
     """One training."""
 
-    shares: dict[str, float]
-    """Parts of the batch by recording, or `RENDERED`, relative to each other."""
-    config: TrainConfig
-    augment: AugmentConfig
-    metric: float
+    name: str = ""
+    metric: float = 1.0
     """Weight of the metres of what is rendered."""
+    config: TrainConfig = field(default_factory=TrainConfig)
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
     weights: SupervisedWeights = field(default_factory=SupervisedWeights)
-
-    def run(
-        self,
-        network: DepthModule,
-        metadata: Metadata,
-        pools: dict[str, Sequence[View]],
-        out: Path,
-        held_out: Sequence[View],
-    ) -> DepthModule:
-        """Train, unless that is done; resumes where it was killed. Returns the averaged weights.
-
-        ``held_out`` draws the curve.
-        """
-        if (out / FINAL).is_file():
-            logger.info("%s is there already", out / FINAL)
-        else:
-            sources = [
-                Source(name, pools[name], share, self.metric if name == RENDERED else 1.0)
-                for name, share in self.shares.items()
-            ]
-            signal = Supervised(sources, metadata, self.augment, self.weights)
-            train(
-                network,
-                metadata,
-                [signal],
-                self.config,
-                out,
-                lambda averaged: score(averaged, metadata, held_out).metrics(),
-                [ProgressBar()],
-            )
-        return load_checkpoint(out / FINAL)[0]
+    shares: dict[str, float] = field(default_factory=dict)
+    """Parts of the batch by source, relative to each other."""
 
 
-# Rendered rooms supervise shape only: their sizes are invented, and as metric labels they double the error in real
-# rooms.
-BROAD = Phase(
-    {"tum_fr1_rpy_depth": 0.5, "icl_livingroom1": 0.15, RENDERED: 0.35},
-    TrainConfig(steps=2200, lr=1e-3, encoder_lr=1.2e-4, lr_end=1.0, validate_every=550, checkpoint_every=100),
-    AugmentConfig(
-        zoom=(0.9, 1.4), aspect=0.05, roll_rad=0.12, tilt_rad=0.08, shift=0.1, saturation=0.4, gamma=(0.8, 1.25)
-    ),
-    metric=0.1,
-)
-SETTLE = Phase(
-    {"tum_fr1_rpy_depth": 0.65, "icl_livingroom1": 0.15, RENDERED: 0.2},
-    TrainConfig(
-        steps=1000, lr=1e-3, encoder_lr=1.2e-4, seed=1, warmup_steps=20, validate_every=500, checkpoint_every=100
-    ),
-    AugmentConfig(
-        zoom=(0.95, 1.25), aspect=0.04, roll_rad=0.1, tilt_rad=0.05, shift=0.1, saturation=0.4, gamma=(0.8, 1.25)
-    ),
-    metric=0.1,
-)
-# Corridors have true widths, and real ones were estimated half as long as they are.
-NEAR = Phase(
-    {"tum_fr1_rpy_depth": 0.25, "icl_livingroom1": 0.1, "icsl_corridor": 0.12, "hololens_a": 0.15, RENDERED: 0.5},
-    TrainConfig(
-        steps=3600,
-        lr=1e-3,
-        encoder_lr=1.5e-4,
-        lr_end=0.03,
-        warmup_steps=20,
-        ema_decay=0.996,
-        seed=5,
-        validate_every=500,
-        checkpoint_every=100,
-        amp=None,
-    ),
-    AugmentConfig(zoom=(0.85, 1.6), aspect=0.06, roll_rad=0.25, gamma=(0.7, 1.4), contrast=0.35, brightness=0.3),
-    metric=0.2,
-    weights=SupervisedWeights(slope=0.1),
-)
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What makes one file of weights."""
+
+    views: Literal["rooms", "places"] = "rooms"
+    places: int = 0
+    """How many are rendered, drawn by `seed`."""
+    seed: int = 0
+    width: int = 400
+    """Of the recordings' images [px]."""
+    input_size: tuple[int, int] | None = None
+    """Height and width [px] of a new network; None goes on from given weights."""
+    encoder: str = ""
+    """File in the data's folder that a new network's encoder begins with."""
+    licence: str = ""
+    calibrate: bool = False
+    """Whether sigma is calibrated in the end."""
+    mean_share: float = 1.0
+    """Of the weights after the training, in their mean with those before."""
+    phase: tuple[Phase, ...] = ()
 
 
-def make_default(data: Path, out: Path) -> Path:
-    """Run both phases; each resumes where it was killed. Returns the finished weights file.
+def read_job(name: str) -> Job:
+    """``default`` or ``near``."""
+    path = Path(__file__).with_name(f"{name}.toml")
+    table = read_mapping(path, "TOML", ConfigError)
+    phases = [_phase(entry, str(path)) for entry in table.pop("phase")]
+    return replace(laid_over(Job(), table, str(path)), phase=tuple(phases))
+
+
+def _phase(table: dict[str, Any], origin: str) -> Phase:
+    shares = table.pop("shares")
+    return replace(laid_over(Phase(), table, origin), shares=shares)
+
+
+def make(job: Job, data: Path, out: Path, start: Path | None, device: str) -> tuple[DepthModule, Metadata]:
+    """Run all phases; each resumes where it was killed. Returns the finished network and its record.
 
     Args:
-        data: Folder with the recordings and the ImageNet encoder.
+        job: Which.
+        data: Folder with the recordings and the encoder.
         out: Folder for everything.
-    """
-    torch.manual_seed(0)
-    height, width = INPUT_SIZE
-    names = ("ImageNet (encoder)", *BROAD.shares)
-    metadata = Metadata(input_height=height, input_width=width, data=names, licence=LICENCE)
-    rooms, held_out = _rendered(out / RENDERED, room_views, NUMBER_OF_ROOMS, seed=7)
-    pools = _pools(data, BROAD, rooms, width=400)
-    new = build_network(metadata)
-    load_imagenet_encoder(new, data / IMAGENET)
-    network: DepthModule = new
-    for phase, name in ((BROAD, "broad"), (SETTLE, "settle")):
-        network = phase.run(network, metadata, pools, out / name, held_out)
-    save_checkpoint(network, calibrate_sigma(network, metadata, held_out), out / "default.safetensors", half=True)
-    return out / "default.safetensors"
-
-
-def make_near(data: Path, out: Path, start: Path | None, device: str = "auto") -> Path:
-    """Train; resumes where it was killed. Returns the file with the mean of the weights before and after.
-
-    Args:
-        data: Folder with the recordings.
-        out: Folder for everything.
-        start: Weights to begin with; the shipped ones by default.
+        start: Weights to go on from; the shipped ones by default.
         device: Where it is computed.
     """
-    places, held_out = _rendered(out / RENDERED, place_views, NUMBER_OF_PLACES, seed=21)
-    network, metadata = load_checkpoint(start)
-    data_names = tuple(dict.fromkeys((*metadata.data, *NEAR.shares)))
-    metadata = replace(metadata, data=data_names, metrics={}, sigma_scale=1.0, sigma_floor=0.0)
-    phase = replace(NEAR, config=replace(NEAR.config, device=device))
-    after = phase.run(network, metadata, _pools(data, NEAR, places, width=320), out, held_out)
-    before = load_checkpoint(start)[0]
-    before.load_state_dict(mean_of(before, after, MEAN_SHARE))
-    save_checkpoint(before, metadata, out / "mean.safetensors", half=True)
-    return out / "mean.safetensors"
-
-
-def _rendered(
-    folder: Path, views: Callable[[np.random.Generator], Drawn], places: int, seed: int
-) -> tuple[list[View], list[View]]:
-    """Rendered views to learn from, and `HELD_OUT_VIEWS` or some more of the first places, held out."""
-    taught: list[View] = []
+    names = [name for phase in job.phase for name in phase.shares]
+    draw = {"rooms": room_views, "places": place_views}[job.views]
+    pools: dict[str, Any] = {RENDERED: []}
     held_out: list[View] = []
-    for file in render_files(folder, views, places, seed):
-        (taught if len(held_out) >= HELD_OUT_VIEWS else held_out).extend(stored_views(file))
-    return taught, held_out
+    for file in render_files(out / RENDERED, draw, job.places, job.seed):
+        (pools[RENDERED] if len(held_out) >= HELD_OUT_VIEWS else held_out).extend(stored_views(file))
+    pools |= {name: load_depth_folder(data / name, job.width).views for name in {*names} - {RENDERED}}
+    if job.input_size is not None:
+        height, width = job.input_size
+        learnt = dict.fromkeys(("ImageNet (encoder)", *names))
+        metadata = Metadata(input_height=height, input_width=width, data=tuple(learnt), licence=job.licence)
+        torch.manual_seed(0)
+        new = build_network(metadata)
+        load_imagenet_encoder(new, data / job.encoder)
+        network: DepthModule = new
+    else:
+        network, metadata = load_checkpoint(start)
+        learnt = dict.fromkeys((*metadata.data, *names))
+        metadata = replace(metadata, data=tuple(learnt), metrics={}, sigma_scale=1.0, sigma_floor=0.0)
+
+    def validate(averaged: DepthModule) -> dict[str, float]:
+        return score(averaged, metadata, held_out).metrics()
+
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    for phase in job.phase:
+        sources = [
+            Source(name, pools[name], share, phase.metric if name == RENDERED else 1.0)
+            for name, share in phase.shares.items()
+        ]
+        signal = Supervised(sources, metadata, phase.augment, phase.weights)
+        config, folder = replace(phase.config, device=device), out / phase.name
+        if not (folder / FINAL).is_file():
+            train(network, metadata, [signal], config, folder, validate, [ProgressBar()])
+        network = load_checkpoint(folder / FINAL)[0]
+    if job.mean_share < 1:
+        network.load_state_dict(mean_of(before, network.state_dict(), job.mean_share))
+    return network, calibrate_sigma(network, metadata, held_out) if job.calibrate else metadata
 
 
-def _pools(data: Path, phase: Phase, rendered: Sequence[View], width: int) -> dict[str, Sequence[View]]:
-    """What a phase draws from, by name."""
-    return {
-        name: rendered if name == RENDERED else load_depth_folder(data / name, width).views for name in phase.shares
-    }
-
-
-def mean_of(first: DepthModule, second: DepthModule, share: float) -> dict[str, torch.Tensor]:
+def mean_of(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor], share: float) -> dict[str, torch.Tensor]:
     """State of ``(1 - share) first + share second``; whole numbers are the first's.
 
     Raises:
-        WeightsError: If they are not the same network.
+        WeightsError: If they are not of the same network.
     """
-    one, other = first.state_dict(), second.state_dict()
-    if {k: v.shape for k, v in one.items()} != {k: v.shape for k, v in other.items()}:
+    if {k: v.shape for k, v in first.items()} != {k: v.shape for k, v in second.items()}:
         raise WeightsError("only weights of one network have a mean: these differ in names or shapes")
-    return {k: v.lerp(other[k], share) if v.is_floating_point() else v for k, v in one.items()}
+    return {k: v.lerp(second[k], share) if v.is_floating_point() else v for k, v in first.items()}
 
 
 def main() -> None:
@@ -218,14 +154,14 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with the recordings")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--weights", type=Path, help="near: to begin with (default: the shipped ones)")
-    parser.add_argument("--device", default="auto", choices=DEVICES, help="near: where it is computed")
+    parser.add_argument("--device", default="auto", choices=DEVICES, help="where it is computed")
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     torch.set_num_threads(1)
-    if args.job == "default":
-        logger.info("weights: %s", make_default(args.data, args.out))
-    else:
-        logger.info("weights: %s", make_near(args.data, args.out, args.weights, args.device))
+    network, metadata = make(read_job(args.job), args.data, args.out, args.weights, args.device)
+    path = args.out / f"{args.job}.safetensors"
+    save_checkpoint(network, metadata, path, half=True)
+    logger.info("weights: %s", path)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.figures import compared
 from edgeslam_torch.eval.judge.score import COLUMNS
 from edgeslam_torch.eval.judge.table import markdown
-from edgeslam_torch.eval.judge.thresholds import read_thresholds, verdicts_of_cell, verdicts_of_groups
+from edgeslam_torch.eval.judge.thresholds import read_thresholds, verdicts
 
 
 def row(cell, seed=0, error="", **figures):
@@ -30,31 +30,31 @@ def thresholds(tmp_path):
 
 def test_every_seed_must_be_within_the_limit(thresholds):
     rows = [row("desk", 0, ate_m=0.01, supported_end=1.0), row("desk", 1, ate_m=0.03, supported_end=1.0)]
-    ate, supported = verdicts_of_cell("desk", rows, thresholds)
+    ate, supported = verdicts(rows, thresholds, "desk")
     assert not ate.ok and (ate.passed, ate.runs, ate.worst) == (1, 2, 0.03)
     assert supported.ok
 
 
 def test_figure_that_is_missing_does_not_pass(thresholds):
-    assert [v.ok for v in verdicts_of_cell("desk", [row("desk", ate_m=0.01)], thresholds)] == [True, False]
+    assert [v.ok for v in verdicts([row("desk", ate_m=0.01)], thresholds, "desk")] == [True, False]
 
 
 def test_variant_is_compared_with_the_median_of_its_base(thresholds):
     base = [row("desk", seed, ate_m=ate) for seed, ate in enumerate((0.01, 0.02, 0.05))]
     near, far = row("desk/half_rate", ate_m=0.06), row("desk/half_size", ate_m=0.061)
-    assert verdicts_of_cell("desk/half_rate", [*base, near], thresholds)[0].ok
-    assert not verdicts_of_cell("desk/half_size", [*base, far], thresholds)[0].ok
-    assert verdicts_of_cell("desk/half_size", [far], thresholds) == [], "without its base it cannot be judged"
+    assert verdicts([*base, near], thresholds, "desk/half_rate")[0].ok
+    assert not verdicts([*base, far], thresholds, "desk/half_size")[0].ok
+    assert verdicts([far], thresholds, "desk/half_size") == [], "without its base it cannot be judged"
 
 
 def test_share_of_all_runs_is_enough_where_a_bar_says_so(thresholds):
     rows = [row(f"flight/{k}", seed, ate_percent=p) for k, seed, p in
             (("room", 0, 0.4), ("room", 1, 0.6), ("hall", 0, 0.1), ("hall", 1, 0.2))]  # fmt: skip
-    (verdict_,) = verdicts_of_groups(rows, thresholds)
+    (verdict_,) = verdicts(rows, thresholds)
     assert verdict_.ok and verdict_.passed == 3
     rows[0]["figures"]["ate_percent"] = 0.7
-    assert not verdicts_of_groups(rows, thresholds)[0].ok
-    assert verdicts_of_cell("flight/room", rows, thresholds) == []
+    assert not verdicts(rows, thresholds)[0].ok
+    assert verdicts(rows, thresholds, "flight/room") == []
 
 
 def test_bar_that_says_nothing_is_refused(tmp_path):
