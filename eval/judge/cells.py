@@ -1,7 +1,7 @@
 """Cells of the judge: one source with one seed each. `cases.toml` has what is special to a recording."""
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -121,36 +121,42 @@ def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequen
     """
     if which not in SETS:
         raise EvaluationError(f"no set {which!r}; there are {', '.join(SETS)}")
-    made: list[Cell] = []
-    recordings = find_recordings(data, MIN_FRAMES) if data is not None else {}
-    for name, (folder, stamps_s) in recordings.items():
-        frames, wanted = len(stamps_s), [""] if which in ("base", "all") else []
-        if which in ("variants", "all"):
-            wanted += [*(v for v, change in VARIANTS.items() if change.frames_of(frames) >= MIN_FRAMES), BACKWARDS]
-        if which in ("flights", "all"):
-            segments, half = CASES[KIDNAP].get(name), CASES[SECOND_FLIGHT].get(name)
-            wanted += [KIDNAP] if segments and frames >= max(last for _, last in segments) else []
-            wanted += [SECOND_FLIGHT] if half and frames >= 2 * half else []
-        made += [Cell(f"{name}/{variant}" if variant else name, 0, str(folder), variant) for variant in wanted]
-        if which in ("telemetry", "all") and name in CASES["telemetry"]:
-            made += [Cell(f"telemetry/{kind}/{name}", 0, str(folder), telemetry=kind) for kind in KINDS]
-        if which in ("imu", "all") and name in CASES["imu"]["recordings"]:
-            made += [Cell(f"imu/{kind}/{name}", 0, str(folder), imu=kind) for kind in IMU_KINDS]
-        if which in ("imu", "all") and name in CASES["imu"][RECORDED]:
-            made.append(Cell(f"imu/{RECORDED}/{name}", 0, str(folder), imu=RECORDED))
-    if which in ("imu", "all"):
-        made += [
-            Cell(f"imu/{kind}/{course}", 0, course=course, imu=kind)
-            for course in CASES["imu"]["courses"]
-            for kind in CASES["imu"]["kinds"]
-        ]
-    if which in ("flights", "all"):
-        made += [Cell(f"flight/{course}", 0, course=course) for course in COURSES]
-        for variant, courses in CASES["courses"].items():
-            made += [Cell(f"flight/{course}/{variant}", 0, variant=variant, course=course) for course in courses]
-        made += [Cell(f"none/{kind}", 0, nothing=kind) for kind in NONE]
+    made = [cell for of, cell in (*_of_recordings(data), *_of_simulations()) if which in (of, "all")]
     kept = [cell for cell in made if not only or any(fnmatchcase(cell.name, pattern) for pattern in only)]
     if not kept:
         there = ", ".join(dict.fromkeys(cell.name for cell in made)) or "none (no recordings: DATA or EDGESLAM_DATA)"
         raise EvaluationError(f"no cell matches; there are: {there}")
     return [replace(cell, seed=seed) for cell in kept for seed in seeds]
+
+
+def _of_recordings(data: Path | None) -> Iterator[tuple[str, Cell]]:
+    """Sets and their cells."""
+    for name, (place, stamps_s) in find_recordings(data, MIN_FRAMES).items() if data is not None else ():
+        folder, frames = str(place), len(stamps_s)
+        yield "base", Cell(name, 0, folder)
+        changed = [variant for variant, change in VARIANTS.items() if change.frames_of(frames) >= MIN_FRAMES]
+        segments, half = CASES[KIDNAP].get(name), CASES[SECOND_FLIGHT].get(name)
+        flown = [KIDNAP] if segments and frames >= max(last for _, last in segments) else []
+        flown += [SECOND_FLIGHT] if half and frames >= 2 * half else []
+        for of, variants in (("variants", [*changed, BACKWARDS]), ("flights", flown)):
+            for variant in variants:
+                yield of, Cell(f"{name}/{variant}", 0, folder, variant)
+        for kind in KINDS if name in CASES["telemetry"] else ():
+            yield "telemetry", Cell(f"telemetry/{kind}/{name}", 0, folder, telemetry=kind)
+        kinds = [*IMU_KINDS] if name in CASES["imu"]["recordings"] else []
+        for kind in (*kinds, *([RECORDED] if name in CASES["imu"][RECORDED] else ())):
+            yield "imu", Cell(f"imu/{kind}/{name}", 0, folder, imu=kind)
+
+
+def _of_simulations() -> Iterator[tuple[str, Cell]]:
+    """The same without recordings."""
+    for course in CASES["imu"]["courses"]:
+        for kind in CASES["imu"]["kinds"]:
+            yield "imu", Cell(f"imu/{kind}/{course}", 0, course=course, imu=kind)
+    for course in COURSES:
+        yield "flights", Cell(f"flight/{course}", 0, course=course)
+    for variant, courses in CASES["courses"].items():
+        for course in courses:
+            yield "flights", Cell(f"flight/{course}/{variant}", 0, variant=variant, course=course)
+    for kind in NONE:
+        yield "flights", Cell(f"none/{kind}", 0, nothing=kind)

@@ -22,7 +22,6 @@ from edgeslam_torch.synthetic.flights.courses import (
     record_course,
     simulated_camera,
 )
-from edgeslam_torch.synthetic.flights.writer import record_flight
 from edgeslam_torch.synthetic.house.render import render
 
 NONE = ("noise", "black", "frozen")
@@ -80,23 +79,11 @@ def _simulator() -> str:
     return digest.hexdigest()[:8]
 
 
-def _record_again(folder: Path, name: str, seed: int, flight: int) -> None:
-    """Another flight through the world of a course."""
-    course = COURSES[name]
-    world, rng = course.world(np.random.default_rng(seed)), np.random.default_rng([seed, flight])
-    flown_again = course.fly(rng, world, round(course.seconds * course.rate_hz))
-    camera = simulated_camera()
-    record_flight(folder, world, flown_again, rng, camera, course.telemetry, course.faults, seed=seed + flight)
-
-
 def record_once(folder: Path, course: str, seed: int, flight: int = 0) -> None:
     """Record into a temporary folder and rename it to ``folder`` when complete; the first of several processes wins."""
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as own:
         part = Path(own) / folder.name
-        if flight == 0:
-            record_course(part, COURSES[course], seed)
-        else:
-            _record_again(part, course, seed, flight)
+        record_course(part, COURSES[course], seed, flight=flight)
         try:
             part.rename(folder)
         except OSError:

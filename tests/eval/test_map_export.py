@@ -71,16 +71,6 @@ def test_pcd_is_what_the_format_page_says(cloud, tmp_path):
     np.testing.assert_array_equal(points["observations"], cloud.observations)
 
 
-def test_plyfile_reads_what_was_written(cloud, tmp_path):
-    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed")
-    write_ply(tmp_path / "m.ply", cloud)
-    found = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
-    np.testing.assert_array_equal(np.stack([found[k] for k in "xyz"], axis=1), cloud.p_w)
-    np.testing.assert_array_equal(np.stack([found[k] for k in ("red", "green", "blue")], axis=1), cloud.colour)
-    np.testing.assert_array_equal(found["sigma"], cloud.sigma_m)
-    np.testing.assert_array_equal(found["observations"], cloud.observations)
-
-
 READ_COLMAP = """
 import json, sys, pycolmap
 r = pycolmap.Reconstruction(sys.argv[1])
@@ -165,14 +155,6 @@ def test_space_is_free_up_to_two_sigma_before_what_was_seen(sigma_m, x, expected
     assert value_at(grid, x, 0.0) == expected
 
 
-def test_sight_above_the_heights_frees_nothing():
-    wall = wall_at(2.0)
-    lamps = wall + [0.0, 0.0, 2.0]  # seen at 45 degrees upwards: the ray leaves the heights half a metre ahead
-    grid = occupancy_grid(np.concatenate([wall, lamps]), seen_from((0.0, 0.0, 1.0), lamps), np.array([[0.0, 0.0, 1.0]]))
-    assert value_at(grid, 0.35, 0.0) == FREE
-    assert value_at(grid, 1.0, 0.0) == UNKNOWN
-
-
 def test_point_without_a_sigma_frees_nothing():
     wall = wall_at(2.0)
     lines = seen_from((0.0, 0.0, 1.0), wall, np.nan)
@@ -207,13 +189,6 @@ def test_nerfstudio_without_images_says_so(run_folder, tmp_path):
     save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
     with pytest.raises(EdgeSlamError, match=r"images of the keyframes are not there; .*--keep-images"):
         export(tmp_path / "a", "--format", "nerfstudio")
-
-
-def test_run_without_observations_has_points_without_images(run_folder, tmp_path, capsys):
-    run_folder(tmp_path / "a")
-    save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
-    assert export(tmp_path / "a", "--format", "colmap") == 0
-    assert "points are not linked to images" in capsys.readouterr().out
 
 
 def test_occupancy_needs_metres(run_folder, tmp_path):

@@ -86,24 +86,31 @@ def simulated_camera(width: int = 640, height: int = 480) -> Camera:
     return replace(PRESETS["tello"].scaled(width, height), source="simulated Tello")
 
 
-def flown(course: Course, seed: int, seconds: float | None = None) -> tuple[World, Flight, Rng]:
+def flown(course: Course, seed: int, seconds: float | None = None, flight: int = 0) -> tuple[World, Flight, Rng]:
     """World and flight of a course, and the generator for its telemetry.
+
+    Args:
+        course: What is flown.
+        seed: Of the world, and of its first flight.
+        seconds: Length; the course's own when None.
+        flight: Number of a further flight in the same world, on another path.
 
     Raises:
         ValueError: If the world has no free place to fly in.
     """
     rng = np.random.default_rng(seed)
     world = course.world(rng)
+    if flight:
+        rng = np.random.default_rng([seed, flight])
     frames = round((course.seconds if seconds is None else seconds) * course.rate_hz)
     return world, course.fly(rng, world, frames), rng
 
 
-def record_course(folder: FilePath, course: Course, seed: int, seconds: float | None = None, threads: int = 1) -> None:
-    """Fly a course and leave its recording in ``folder``.
+def record_course(folder: FilePath, course: Course, seed: int, seconds: float | None = None, flight: int = 0) -> None:
+    """Fly a course and leave its recording in ``folder``; arguments as for `flown`.
 
     Raises:
         OutputError: If the folder cannot be written to.
     """
-    world, flight, rng = flown(course, seed, seconds)
-    camera = simulated_camera()
-    record_flight(folder, world, flight, rng, camera, course.telemetry, course.faults, seed=seed, threads=threads)
+    world, path, rng = flown(course, seed, seconds, flight)
+    record_flight(folder, world, path, rng, simulated_camera(), course.telemetry, course.faults, seed=seed + flight)

@@ -16,7 +16,6 @@ from edgeslam_torch.eval.benchmark.rows import (
     markdown_networks,
     run_ablation,
 )
-from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.files.config_file import load_config
 
 
@@ -70,14 +69,6 @@ def test_rows_have_settings_that_exist_and_are_compared_with_rows():
         except ConfigError as error:
             pytest.fail(f"{name}: {error}")
         exec(row.first.partition(";")[0])  # the module is there
-
-
-@pytest.mark.parametrize(
-    ("names", "only", "message"), [(("nonsense",), (), "no row"), ((), ("x",), "no sequence 'x'; there are kitchen")]
-)
-def test_unknown_names_are_refused(runs, tmp_path, names, only, message):
-    with pytest.raises(EvaluationError, match=message):
-        ablation(tmp_path, *names, only=only)
 
 
 def test_depth_networks_are_beside_each_other(runs, tmp_path):

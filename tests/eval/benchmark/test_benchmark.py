@@ -8,10 +8,9 @@ import pytest
 from markdown_rows import rows
 
 from edgeslam_torch.commands.judging import bench
-from edgeslam_torch.eval.benchmark.benchmark import FIGURES, BenchSettings, figures_of, markdown_bench, sequences
+from edgeslam_torch.eval.benchmark.benchmark import BenchSettings, markdown_bench, sequences
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.experiment.figures import compared, read_record
-from edgeslam_torch.eval.metrics.run_score import evaluate_run
+from edgeslam_torch.eval.experiment.figures import read_record
 
 
 def record(ate, **conditions):
@@ -29,20 +28,6 @@ def test_table_lists_every_run_its_median_its_noise_and_the_peers():
     assert cells[1:4] == [[f"edgeslam, seed {k}", ate] for k, ate in enumerate(("0.0100", "0.0110", "0.0130"))]
     assert [row[1] for row in cells[4:6]] == ["0.0110", "0.0025"], "2 sqrt(2 s^2 / 3), s = 0.0015"
     assert any(system.startswith("ORB-SLAM2") and ate == "0.0098 0.0094 0.1562 0.0100 0.0099" for system, ate in cells)
-
-
-def test_comparison_names_other_conditions():
-    others = record([0.02], machine={"cpu": "other"}, max_frames=40)
-    text = compared(record([0.01]), others, "runs", "sequence", FIGURES)
-    assert "cpu was some, then other" in text and "max_frames was None, then 40" in text
-    assert "worse: tum_fr1_xyz ATE Sim(3) [m] x2.00" in text
-
-
-def test_figures_are_plain_numbers(run_folder, tmp_path):
-    truth = run_folder(tmp_path / "a")
-    found = figures_of(evaluate_run(tmp_path / "a", truth))
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
-    assert found["ate_sim3_m"] is not None and found["cpu_ms_per_frame"] == 33.1
 
 
 def test_only_recordings_at_camera_rate_are_benchmarked(run_folder, tmp_path):

@@ -57,12 +57,6 @@ def test_crash_kill_and_time_out_are_rows_and_the_rest_goes_on(tmp_path):
     assert good["figures"]["ate_m"] == 0.01
 
 
-def test_variants_follow_their_recording_and_simulations_come_last(tmp_path):
-    names = ["flight/room", "desk/half_rate", "wood", "none/black", "desk"]
-    record = run(tmp_path, names, Starter(), jobs=5)
-    assert [row["cell"] for row in record["rows"]] == ["desk", "desk/half_rate", "wood", "flight/room", "none/black"]
-
-
 def test_what_is_done_is_not_done_again(tmp_path):
     starter = Starter(crash=CRASH)
     run(tmp_path, ["a", "crash"], starter)
@@ -85,13 +79,6 @@ def test_half_written_result_is_no_result(tmp_path):
     (tmp_path / "cells" / "a-s0" / "result.json").write_text('{"key": ')
     run(tmp_path, ["a"], starter)
     assert starter.started == ["a", "a"]
-
-
-def test_record_holds_what_earlier_calls_left(tmp_path):
-    starter = Starter()
-    run(tmp_path, ["a"], starter)
-    assert [row["cell"] for row in run(tmp_path, ["b"], starter)["rows"]] == ["a", "b"]
-    assert [row["cell"] for row in run(tmp_path, ["b"], starter, commit="def")["rows"]] == ["b"]
 
 
 def test_interrupted_judge_leaves_no_process(tmp_path):

@@ -106,12 +106,6 @@ def test_corrected_rows_are_reported(tmp_path):
     assert "not finite" in notes and "out of order" in notes and "repeat a stamp" in notes
 
 
-def test_reversed_time_is_sorted_and_said(tmp_path):
-    found = read_trajectory(tum(tmp_path / "t.txt", GOOD[::-1]))
-    assert found.positions[:, 0].tolist() == [0.0, 1.0, 2.0]
-    assert "backwards" in found.notes[0]
-
-
 def test_line_cut_off_at_the_end_is_left_out(tmp_path):
     (tmp_path / "t.txt").write_text("\n".join([*GOOD, "0.3 1 2"]))  # killed while writing: no newline
     assert len(read_trajectory(tmp_path / "t.txt")) == 3
@@ -232,13 +226,6 @@ def test_positions_alone_are_a_trajectory(loop, tmp_path):
     found = read_trajectory(tmp_path / "p.txt")
     assert not found.oriented
     np.testing.assert_allclose(found.positions, loop.positions)
-
-
-@pytest.mark.parametrize("digits", [0, 1])
-def test_rounded_stamps_are_named_as_the_cause(digits, loop, tmp_path):
-    rows = [f"{t:.{digits}f} {x} {y} {z} 0 0 0 1" for t, (x, y, z) in zip(loop.stamps_s, loop.positions, strict=True)]
-    with pytest.raises(EvaluationError, match="digits"):
-        read_trajectory(tum(tmp_path / "t.txt", rows))
 
 
 def test_pose_of_a_marker_goes_through_its_own_mount(loop, tmp_path):

@@ -12,7 +12,7 @@ from edgeslam_torch.eval.judge import flights
 def test_flight_is_recorded_once_and_only_whole(tmp_path, monkeypatch):
     calls = []
 
-    def record(part, course, seed):
+    def record(part, course, seed, flight):
         calls.append(seed)
         if seed == 3:
             raise OutputError("no space left")
@@ -31,7 +31,7 @@ def test_judges_that_record_one_flight_at_a_time_leave_it_whole(tmp_path, monkey
     folder = tmp_path / "room-s0"
     begun = []
 
-    def record(part, course, seed):
+    def record(part, course, seed, flight):
         part.mkdir()
         begun.append(part)
         (part / "first").touch()

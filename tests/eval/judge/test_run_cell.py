@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from rendered import CAMERA, film, sideways, stairs_world
 
-from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import find_recordings, open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory, write_tum
@@ -82,11 +81,6 @@ def test_run_that_never_moves_scores_a_fixed_position(recording, judged, tmp_pat
     assert notes == ["the estimated trajectory never moves: nothing to align"]
 
 
-def test_cell_that_cannot_run_says_why(tmp_path):
-    with pytest.raises(SourceError, match="no such file or folder"):
-        run(tmp_path, Cell("gone", 0, str(tmp_path / "gone")))
-
-
 def test_a_recordings_own_imu_is_a_cell_of_its_own(recording, tmp_path):
     with_imu = tmp_path / "stairs"
     shutil.copytree(recording, with_imu)
@@ -115,16 +109,6 @@ def test_simulated_flight_is_judged_by_its_world(tmp_path, monkeypatch):
 def test_map_of_a_simulation_is_judged_by_its_surfaces(recording, judged):
     figures, _ = score(judged[0] / "run", Truth(recording, surfaces=stairs_world().distance_to_surface))
     assert figures["map_judged"] == 1.0 and 0.0 < figures["map_median_m"] < 0.05 and figures["map_within_10cm"] > 0.8
-
-
-@pytest.mark.parametrize("kind", ["noise", "black", pytest.param("frozen", marks=pytest.mark.slow)])
-def test_nothing_to_see_is_a_source_like_any_other(kind):
-    source = flights.nothing_to_see(kind, 1)
-    frames = [next(frames) for frames in [source.frames()] for _ in range(2)]
-    same = np.array_equal(frames[0].image, frames[1].image)
-    assert same == (kind != "noise")
-    assert frames[0].image.any() == (kind != "black")
-    assert frames[0].image.shape == (480, 640, 3) and source.length == flights.NONE_FRAMES
 
 
 def test_nothing_to_see_claims_no_map(tmp_path):
@@ -183,15 +167,6 @@ def test_a_further_flight_has_another_path_through_the_same_world(tmp_path, monk
     assert world.clearance(again.positions[0]) > 0.2, "in free space of that world"
 
 
-@pytest.mark.slow
-def test_a_further_flight_through_the_building_takes_off_from_the_same_place(tmp_path, monkeypatch):
-    monkeypatch.setitem(COURSES, "building", replace(COURSES["building"], seconds=6.0, rate_hz=2.0))
-    flights.record_once(tmp_path / "again", "building", 0, 1)
-    first = flights.flown(COURSES["building"], 0)[1].T_w_c[:, :3, 3]
-    apart = np.linalg.norm(open_dataset(tmp_path / "again").truth.positions - first, axis=1)
-    assert apart[0] < 0.05 and apart.max() > 0.1
-
-
 def test_recordings_with_truth_are_found_and_short_variants_left_out(recording):
     for data in (recording.parent, recording):
         ((name, (folder, stamps_s)),) = find_recordings(data).items()
@@ -211,11 +186,6 @@ def test_cells_are_chosen_by_pattern_and_repeated_by_seed(recording):
     assert {c.base for c in cells} == {"stairs"}
     with pytest.raises(EvaluationError, match="no cell matches; there are: .*stairs/half_size"):
         list_cells(recording.parent, "variants", [0], ["nothing"])
-
-
-def test_folder_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(EvaluationError, match="no such folder of recordings"):
-        list_cells(tmp_path / "gone", "base", [0])
 
 
 def test_a_cut_shows_one_world_and_then_the_next(recording, tmp_path, monkeypatch):

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
-from edgeslam_torch.eval.judge.cells import CASES, list_cells
 from edgeslam_torch.eval.judge.simulated_imu import IMU_KINDS
 from edgeslam_torch.eval.judge.simulated_telemetry import Drawn
 from edgeslam_torch.geometry.gyroscope_check import checked_against_rotation
@@ -31,16 +30,3 @@ def test_only_readings_that_do_not_turn_with_the_camera_are_faulty(drawn, kind):
     check = checked_against_rotation(readings, known, T_S, drawn.truth.T_w_c[:, :3, :3])
     assert (model.T_imu_cam is None) == kind.endswith("unknown")
     assert check.known and bool(check.fault) == (kind in ("degrees", "permuted", "other_flight"))
-
-
-def test_faults_of_the_readings(drawn):
-    assert np.diff(IMU_KINDS["gaps"](drawn)[1].stamps_s).max() > 0.4
-    force = IMU_KINDS["clipped"](drawn)[1].acceleration_m_s2
-    assert (np.abs(force) == np.abs(force).max()).sum() > 50
-    again = IMU_KINDS["mpu6050"](drawn)[1]
-    assert again.acceleration_m_s2.tobytes() == IMU_KINDS["mpu6050"](drawn)[1].acceleration_m_s2.tobytes()
-
-
-def test_cells_of_simulated_flights_are_listed():
-    names = {cell.name for cell in list_cells(None, "imu", [0])}
-    assert names == {f"imu/{kind}/{course}" for kind in CASES["imu"]["kinds"] for course in CASES["imu"]["courses"]}

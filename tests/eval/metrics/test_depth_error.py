@@ -8,7 +8,6 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.metrics.depth_error import (
     compare_folders,
     compare_with_recording,
-    mean_score,
     report_depth,
     score_depth,
 )
@@ -24,14 +23,6 @@ def test_error_worked_out_by_hand():
     assert found.rmse_m == pytest.approx(np.sqrt((0.04 + 4.0) / 3))
     assert found.log_rmse == pytest.approx(np.sqrt((np.log(1.2) ** 2 + np.log(2.0) ** 2) / 3))
     assert (found.delta1, found.delta2, found.delta3) == pytest.approx((2 / 3, 2 / 3, 2 / 3))
-
-
-def test_median_scaling_removes_a_factor(rng):
-    truth = rng.uniform(1.0, 5.0, (20, 30))
-    found = score_depth(0.4 * truth, truth, median_scaled=True)
-    assert found.scale == pytest.approx(2.5)
-    assert found.abs_rel == pytest.approx(0.0, abs=1e-12)
-    assert score_depth(0.4 * truth, truth).delta1 == 0.0
 
 
 def test_edges_are_judged_alone():
@@ -102,11 +93,6 @@ def test_recording_is_matched_by_its_images_and_stamps(tmp_path):
         compare_with_recording(data / "depth", data)
     with pytest.raises(EvaluationError, match=r"no depth.txt"):
         compare_with_recording(ours, ours)
-
-
-def test_mean_is_over_maps():
-    a, b = score_depth(np.full((2, 2), 1.2), np.ones((2, 2))), score_depth(np.full((9, 9), 1.1), np.ones((9, 9)))
-    assert mean_score([a, b]).abs_rel == pytest.approx(0.15)
 
 
 @pytest.mark.data

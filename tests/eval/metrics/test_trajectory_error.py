@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.associate import associate, match
+from edgeslam_torch.eval.inputs.associate import associate
 from edgeslam_torch.eval.inputs.clocks import on_one_clock
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.eval.metrics.align import AlignmentKind, umeyama
@@ -41,12 +41,6 @@ def test_umeyama_recovers_what_was_applied(rng):
     assert found.scale == pytest.approx(2.5, abs=1e-12)
     np.testing.assert_allclose(found.R, R, atol=1e-12)
     np.testing.assert_allclose(found.t, t, atol=1e-12)
-
-
-def test_umeyama_never_mirrors(rng):
-    p = rng.normal(size=(30, 3))
-    found = umeyama(p, p * [1.0, 1.0, -1.0])
-    assert np.linalg.det(found.R) == pytest.approx(1.0)
 
 
 def test_error_worked_out_by_hand():
@@ -148,14 +142,6 @@ def test_reference_trajectories_score_what_evo_prints(name, data_dir):
     assert found == pytest.approx((rmse, mean, std, most), abs=1e-6)
     near = (truth.stamps_s > estimate.stamps_s[200]) & (truth.stamps_s < estimate.stamps_s[500])
     assert_agrees(truth.take(near), estimate.take(slice(200, 500)), AlignmentKind.SIM3)  # evo is slow
-
-
-def test_each_pose_of_the_shorter_list_gets_its_nearest():
-    truth, estimate = np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.11, 0.29, 5.0])
-    i, j = match(truth, estimate, 0.02)
-    assert i.tolist() == [1, 3] and j.tolist() == [0, 1]
-    i, j = match(estimate, truth, 0.02)
-    assert i.tolist() == [0, 1] and j.tolist() == [1, 3]
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")])
@@ -264,11 +250,6 @@ def test_figures_that_need_orientations_are_left_out_without(whose, alone, loop,
     assert said.startswith(whose) and "left out" in said
 
 
-def test_a_camera_that_only_shifts_has_orientations(loop, rng):
-    jitter = Rotation.from_rotvec(rng.normal(0.0, 0.003, (len(loop), 3))).as_matrix()
-    assert score_trajectory(turned(loop, np.eye(3)), turned(noisy(loop, rng), jitter)).rotation_deg.rmse < 2.0
-
-
 @pytest.mark.parametrize("noise_m", [0.0, 2e-4])
 def test_a_truth_that_never_moves_is_refused(noise_m, loop, rng):
     still = at(replace(loop, source="gt.txt"), [3.0, 2.0, 1.0] + noise_m * rng.normal(size=(len(loop), 3)))
@@ -281,13 +262,6 @@ def test_a_score_of_hardly_any_pairs_is_refused(loop):
     stamps = loop.stamps_s[0] + 0.0251 + 1.037 * (loop.stamps_s - loop.stamps_s[0])
     with pytest.raises(EvaluationError, match=r"poses have a match.*--max-dt"):
         score_trajectory(loop, replace(loop, stamps_s=stamps), max_dt_s=0.001)
-
-
-def test_late_stamps_are_measured(loop, rng):
-    estimate = noisy(loop, rng)
-    text = findings(loop, replace(estimate, stamps_s=estimate.stamps_s + 1.37))
-    found = re.search(r"--offset (-[\d.]+)", text)
-    assert found is not None and float(found.group(1)) == pytest.approx(-1.37, abs=0.025)  # half a frame
 
 
 def walked(trajectory):
@@ -336,12 +310,6 @@ def test_clocks_that_never_meet_are_brought_together_by_shape(factor, loop, rng)
     assert found is not None and float(found.group(1)) == pytest.approx(truth.stamps_s[40], abs=0.03)
     fitted = score_trajectory(truth, estimate, offset_s=float(found.group(1)), max_dt_s=0.03)
     assert fitted.ate_m.rmse < 0.03
-
-
-def test_no_offset_is_offered_for_another_shape(loop):
-    with pytest.raises(EvaluationError) as caught:
-        score_trajectory(loop, replace(at(loop, walked(loop)), stamps_s=loop.stamps_s + 300.0))
-    assert "fit best" not in str(caught.value)
 
 
 def test_monocular_run_judged_without_scale_is_warned_about(loop, rng):

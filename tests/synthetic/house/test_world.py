@@ -1,7 +1,6 @@
 """What a world knows about its surfaces and solids, by hand."""
 
 import numpy as np
-import pytest
 
 from edgeslam_torch.synthetic.house.world import Box, Boxes, Quad, Texture, World
 
@@ -27,9 +26,3 @@ def test_clearance_is_the_distance_to_the_nearest_wall_or_solid():
     np.testing.assert_allclose(world.clearance(p), [1.0, 0.5, 0.1, 0.0, -0.5], atol=1e-12)
     np.testing.assert_allclose(Boxes([turned]).distance(p), turned.distance(p), atol=1e-12)
     assert np.isinf(Boxes([]).distance(p)).all()
-
-
-@pytest.mark.parametrize("image", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3))])
-def test_a_texture_is_8_bit_colour(image):
-    with pytest.raises(ValueError, match="uint8"):
-        Texture(image)

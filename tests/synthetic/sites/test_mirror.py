@@ -23,10 +23,3 @@ def test_a_mirror_shows_what_is_behind_the_camera_twice_as_far_as_the_mirror():
     assert seen.depth_m[30, 40] == pytest.approx(2 * 1.5 + turned.depth_m[30, 40], abs=0.01)
     assert seen.depth_m[30, 40] == pytest.approx(2 * 1.5 + x, abs=0.01)
     assert world.quads[seen.quad_id[30, 40]].name == REFLECTION
-
-
-def test_a_mirror_is_hit_and_what_it_shows_is_not():
-    site = named_site("mirror", 0)
-    wall = float(site.world.bounds_w[1, 0])
-    line = np.array([[wall - away, 0.0, 1.3] for away in (1.0, 0.5, 0.0)])
-    np.testing.assert_allclose(site.world.distance_to_solid(line), [1.0, 0.5, 0.0], atol=0.02)

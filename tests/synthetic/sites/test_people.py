@@ -35,19 +35,6 @@ def test_a_walker_is_as_far_away_as_their_shoulder(person):
     np.testing.assert_allclose(away, [0.75, 0.0, 0.88], atol=1e-9)
 
 
-def test_a_walker_is_painted_where_they_can_be_hit(person):
-    for at_s in (0.0, 4.3, 9.1):
-        corners = np.concatenate([quad.corners_w for quad in person.painted(at_s)])
-        assert person.distance(corners, at_s).max() < 1e-9
-
-
-def test_walkers_must_walk(rng):
-    with pytest.raises(ValueError, match="two places and a speed"):
-        walker(rng, np.zeros((2, 2)), 0.5)
-    with pytest.raises(ValueError, match="two places and a speed"):
-        walker(rng, np.array([[0.0, 0.0], [1.0, 0.0]]), 0.0)
-
-
 def test_people_are_seen_and_felt_where_they_are_now():
     site = named_site("people", 1)
     walkers = site.walkers

@@ -55,12 +55,6 @@ def test_two_processes_give_the_weights_of_one(run_folder, weights, tmp_path):
     assert len(list((together / "teacher").rglob("swept_*.npy"))) == 11
 
 
-def test_more_processes_than_images_are_refused(run_folder, weights, tmp_path):
-    done = run(*TORCHRUN, *MODULE, *words(run_folder, weights, tmp_path / "out", 4), "--batch", "1")
-    assert done.returncode == 1
-    assert "2 processes for a batch of 1" in done.stderr
-
-
 @pytest.mark.parametrize("killed", [0, 1])
 def test_killed_process_ends_the_other_clearly_and_training_goes_on(run_folder, weights, tmp_path, killed):
     out = tmp_path / "out"

@@ -11,7 +11,7 @@ import torch
 from posed_run import CAMERA, world
 
 from edgeslam_torch.commands.training import distil as command
-from edgeslam_torch.errors import ConfigError, SourceError
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.models.checkpoint import load_checkpoint
 from edgeslam_torch.models.layout import Variant
 from edgeslam_torch.models.onnx.graph import build_graph
@@ -151,8 +151,3 @@ def test_distil_command_writes_weights_and_says_what_was_learnt(run_folder, tmp_
     assert coverage_of(student, metadata, truths) == pytest.approx(0.68, abs=0.25)
     assert command.main(arguments(tmp_path, *words)) == 0
     assert "nothing was left to train" in capsys.readouterr().out
-
-
-def test_student_that_nobody_knows_is_named(run_folder, tmp_path):
-    with pytest.raises(ConfigError, match="mobilenet-nnconv5dw-skipadd-pruned"):
-        command.main(arguments(tmp_path, run_folder, "--teacher", "default", "--student", "small"))

@@ -123,15 +123,6 @@ def test_other_data_into_the_same_folder_is_refused_and_nothing_changes(finetune
     assert contents(tmp_path / "out") == before
 
 
-def test_other_weights_are_refused(finetune, trained, tmp_path):
-    network = narrow_fastdepth(METADATA, seed=1)
-    save_checkpoint(network, METADATA, tmp_path / "other.safetensors")
-    refused(finetune("kitchen", "--weights", str(tmp_path / "other.safetensors")), "weights: ")
-    own = tmp_path / "out" / "weights.safetensors"
-    refused(finetune("kitchen", "--weights", str(own), "--overwrite"), "would be overwritten")
-    assert own.is_file()
-
-
 def test_data_that_changed_on_disk_is_refused(finetune, recordings, tmp_path):
     folder = shutil.copytree(recordings / "kitchen", tmp_path / "kitchen")
     finetune(str(folder), steps=1)
@@ -141,17 +132,6 @@ def test_data_that_changed_on_disk_is_refused(finetune, recordings, tmp_path):
     (folder / "rgb" / "4.png").unlink()
     refused(finetune(str(folder), steps=2), "images of kitchen: 12, ", " then, 11, ")
     assert contents(tmp_path / "out") == before
-
-
-@pytest.mark.slow
-def test_moved_data_and_folder_go_on(finetune, recordings, tmp_path):
-    folder = shutil.copytree(recordings / "kitchen", tmp_path / "here" / "kitchen")
-    finetune(str(folder), out=tmp_path / "first")
-    shutil.move(tmp_path / "here", tmp_path / "there")
-    shutil.move(tmp_path / "first", tmp_path / "second")
-    code, stdout, _ = finetune(str(tmp_path / "there" / "kitchen"), out=tmp_path / "second", steps=10)
-    assert code == 0
-    assert "resumes after step 8" in stdout
 
 
 def test_same_command_again_trains_nothing_and_says_so(finetune, eight_steps, trained, tmp_path):
@@ -210,12 +190,6 @@ def test_files_that_no_finetuning_wrote_are_left_alone(finetune, recordings, tmp
     assert contents(own) == before
 
 
-def test_damaged_record_is_named(finetune, trained, tmp_path):
-    for text in ("", "{}", "[1]", '{"given": {"weights": 1, "data": 5}}', "[" * 100_000):
-        (tmp_path / "out" / "finetune.json").write_text(text)
-        refused(finetune("kitchen"), "finetune.json: unreadable")
-
-
 def test_two_at_the_same_time_are_refused(finetune, tmp_path):
     (tmp_path / "out").mkdir()
     lock = FolderLock(tmp_path / "out")
@@ -247,17 +221,6 @@ def test_mistakes_are_named_before_anything_is_written(finetune, tmp_path, wrong
     refused(finetune("kitchen", *wrong), said)
     refused(finetune("kitchen", steps=0), "--steps must be at least 1")
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-def test_depth_too_far_to_validate_on_is_learnt_from_all_the_same(finetune, recordings, tmp_path):
-    far = shutil.copytree(recordings / "kitchen", tmp_path / "far")
-    for path in (far / "depth").iterdir():
-        cv2.imwrite(str(path), np.full((48, 64), 20_000, np.uint16))
-    code, stdout, _ = finetune(str(far))
-    assert code == 0
-    assert "not validated" in stdout
-    refused(finetune("kitchen", "--validate", str(far), out=tmp_path / "other"), "no depth between 0.1 and 10 m")
 
 
 @pytest.mark.slow

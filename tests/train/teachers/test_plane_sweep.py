@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.train.teachers.plane_sweep import aggregate, sweep_depth
+from edgeslam_torch.train.teachers.plane_sweep import sweep_depth
 
 K = np.array([[100.0, 0.0, 59.5], [0.0, 100.0, 44.5], [0.0, 0.0, 1.0]])
 NORMAL, DISTANCE = np.array([0.3, 0.1, -1.0]), -2.0
@@ -61,13 +61,3 @@ def test_what_one_neighbour_does_not_see_is_taken_from_the_others(rng):
     images[0][:] = texture(np.random.default_rng(9))
     depth = sweep_depth(reference, images, motions, K, INVERSE)
     assert np.mean((np.abs(depth / wall_depth() - 1) < 0.06)[12:78, 15:105]) > 0.85
-
-
-def test_bare_pixels_follow_their_neighbours():
-    """Uninformative costs take the plane of their surroundings; informative ones keep their minimum."""
-    cost = np.full((8, 20, 20), 1.0, np.float32)
-    cost[3] = 0.2
-    cost[:, 6:14, 6:14] = 0.7
-    cost[6, 0, 0] = 0.0
-    found = aggregate(cost, np.zeros((20, 20), np.float32)).argmin(2)
-    assert (found[1:] == 3).all()

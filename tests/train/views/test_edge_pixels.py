@@ -36,11 +36,6 @@ def test_draws_follow_the_generator_and_reach_all_edges():
     assert int((~whole.isnan()).all(-1).sum()) == int(canny_batch(images, 50, 120).sum())
 
 
-def test_image_without_a_batch_is_refused():
-    with pytest.raises(ValueError, match=r"\(3, 40, 48\)"):
-        edge_pixels(squares()[0], 5)
-
-
 @pytest.mark.parametrize("images", [255 * torch.rand(1, 3, 8, 8), torch.full((1, 1, 8, 8), 200, dtype=torch.uint8)])
 def test_grey_levels_are_refused_with_what_to_do(images):
     with pytest.raises(ValueError, match="divide grey levels by 255"):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.train import folder
 from edgeslam_torch.train.recipes.finetune import HELD_OUT, MOST_HELD_OUT, _split
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import DepthFolder
@@ -107,15 +106,6 @@ def test_shards_that_are_none_are_named(tmp_path):
             load_shards(tmp_path / name)
     with pytest.raises(SourceError, match=r"no sample of image, depth and calibration \(half.tar: a has no depth\)"):
         load_shards(tar(tmp_path / "half.tar", {k: v for k, v in sample().items() if "depth" not in k}))
-
-
-def test_record_changes_with_the_content_and_reads_no_sample(tmp_path):
-    write_shards(views(3), tmp_path, "flight")
-    first = folder.content(load_shards(tmp_path))
-    assert first.startswith("3, ")
-    assert folder.content(load_shards(tmp_path)) == first
-    write_shards(views(4)[1:], tmp_path, "flight")
-    assert folder.content(load_shards(tmp_path)) != first
 
 
 class _Counted(list[View]):
