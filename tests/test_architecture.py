@@ -47,6 +47,7 @@ LAYERS = layer_table(TABLE.read_text(encoding="utf-8"))
 PARTS = [part for row in LAYERS for part in row.parts]
 
 
+@cache
 def part_of(name):
     """The table's part that a full module name belongs to, the most particular one; None for other packages."""
     words = name.split(".")
@@ -177,18 +178,6 @@ def test_table_allows_only_imports_in_use():
         (row.parts, other) for row in rows for other in row.may_use if not used & {(p, other) for p in row.parts}
     ]
     assert needless == []
-
-
-MAX_FILES, MAX_LINES = 15, 2700
-
-
-def test_no_folder_is_too_big():
-    folders = {}
-    for path in sources():
-        folders.setdefault(str(path.parent.relative_to(ROOT)), []).append(path)
-    lines = {name: sum(p.read_text(encoding="utf-8").count("\n") for p in files) for name, files in folders.items()}
-    too_big = {name for name, files in folders.items() if len(files) > MAX_FILES or lines[name] > MAX_LINES}
-    assert too_big == set()
 
 
 def test_packages_that_do_not_belong_are_not_imported():

@@ -20,19 +20,6 @@ pytest.importorskip("mkdocs", reason="the documentation's tools are not installe
 
 ROOT = Path(__file__).resolve().parent.parent
 BUILDING = ROOT / "docs" / "building"
-ALL_FOUND = """new Promise((done, fail) => {
-  document.querySelector('[data-md-toggle=search]').click();
-  const field = document.querySelector('.md-search__input');
-  const look = (left) => {  // typed again and again: the index loads after the page, in its own time
-    const found = [...document.querySelectorAll('.md-search-result__link')].map(a => a.getAttribute('href'));
-    if (found.length || !left) return found.length ? done(found) : fail(new Error('nothing found'));
-    field.focus();
-    field.value = left % 2 ? 'webca' : 'webcam';
-    field.dispatchEvent(new KeyboardEvent('keyup', {bubbles: true}));
-    setTimeout(() => look(left - 1), 1000);
-  };
-  look(120);
-})"""
 
 
 def load(name):
@@ -83,14 +70,6 @@ def test_no_page_scrolls_sideways_or_logs_an_error(site, browser, width):
         wide[page.name] = browser.run("document.documentElement.scrollWidth")
     assert set(wide.values()) == {width}, {name: pixels for name, pixels in wide.items() if pixels > width}
     assert len(wide) > 20 and browser.errors == []
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_search_finds_without_server_and_network(site, browser):
-    browser.open(site / "index.html", width=1280, height=844, mobile=False)
-    assert re.search(r"(start|guides|theory)/[\w-]+\.html", browser.run(ALL_FOUND)[0]), "guides come first"
-    assert browser.errors == []
 
 
 @pytest.mark.slow
@@ -154,17 +133,6 @@ def test_formulas_keep_their_place_in_a_docstring():
     assert "<mi>log</mi><mspace" in found
 
 
-def test_formula_at_the_start_of_a_line_does_not_split_its_paragraph():
-    markdown = pytest.importorskip("markdown")
-    text = formulas.formulas_as_mathml("A height above\n:math:`h + c`, which is unknown.\n")
-    assert markdown.markdown(text, extensions=["md_in_html"]).count("<p>") == 1
-
-
-def test_formulas_of_a_page_are_set():
-    found = formulas.fenced_as_mathml("Before.\n\n```math\n\\frac{a}{b}\n```\n\n```\nmath\n```\n")
-    assert found.count("<math") == 1 and "```math" not in found and "```\nmath\n```" in found
-
-
 def test_formula_that_cannot_be_set_is_an_error():
     with pytest.raises(ValueError, match=r"does not know: \\nosuch"):
         formulas.mathml(r"\nosuch{x}", "inline")
@@ -193,13 +161,3 @@ def test_what_a_page_would_load_is_found(tmp_path):
 )
 def test_links_of_the_repository_become_links_of_the_site(link, uri, page):
     assert hooks.turned(link, uri, hooks.home(uri)) == page
-
-
-def test_notebook_becomes_a_page(tmp_path):
-    path = tmp_path / "book.ipynb"
-    path.write_text(
-        '{"cells": [{"cell_type": "markdown", "source": ["# Title\\n", "words"]}, {"cell_type": "code", '
-        '"source": ["1 + 1"], "outputs": [{"data": {"text/plain": ["2"]}}, {"text": ["said\\n"]}]}]}'
-    )
-    text = load("notebook_page").notebook_page(path)
-    assert text.startswith("# Title\nwords\n\n```python\n1 + 1\n```\n\n```text\n2\n```\n\n```text\nsaid\n```\n")

@@ -74,14 +74,6 @@ def test_a_source_without_a_picture_is_an_error_of_one_line(companion, model, tm
     assert reason in err.splitlines()[-1]
 
 
-def test_a_picture_of_too_many_pixels_is_an_error_of_one_line(model, tmp_path):
-    """OpenCV reads its limit while it loads."""
-    (tmp_path / "bomb.pgm").write_bytes(b"P5 17000 17000 255\n")
-    done = apart(model, "--fx", 64, "--fy", 64, "--source", tmp_path / "bomb.pgm")
-    assert (done.returncode, done.stdout) == (1, "")
-    assert "bomb.pgm: more than 50000000 pixels" in done.stderr.splitlines()[-1]
-
-
 def test_a_model_of_others_is_an_error_of_one_line(companion, model, tmp_path):
     foreign = onnx.load(model)
     del foreign.metadata_props[:]

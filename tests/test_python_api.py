@@ -1,6 +1,5 @@
 """What a Python user gives to the system and sees of it."""
 
-import importlib
 import os
 import subprocess
 import sys
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-import edgeslam_torch
 from edgeslam_torch import Camera, EdgeSlam, Frame, SlamConfig, TelemetrySample
 from edgeslam_torch.config import DepthConfig
 from edgeslam_torch.geometry.camera_file import save_camera
@@ -90,15 +88,6 @@ def test_steps_pair_each_frame_with_the_telemetry_since_the_last(tmp_path, write
     assert stamps == [s.stamp_s for s in source.telemetry if s.stamp_s <= steps[-1][0].stamp_s]
     assert all(sample.stamp_s <= frame.stamp_s for frame, samples in steps for sample in samples)
     assert "telemetry" in repr(source) and len(repr(source)) < 200
-
-
-def test_run_is_a_name_of_the_package_however_it_is_imported():
-    module = importlib.import_module("edgeslam_torch.run")
-    assert callable(edgeslam_torch.run)
-    assert edgeslam_torch.run.Mode is module.Mode
-    assert "run" in edgeslam_torch.__all__
-    with pytest.raises(TypeError, match="source"):  # it is called, and no source is given
-        edgeslam_torch.run()
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="counts threads by /proc")

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.calibration.board import Board, board_size, calibrate
+from edgeslam_torch.calibration.board import Board, calibrate
 from edgeslam_torch.cli import main
 from edgeslam_torch.errors import CalibrationError
 from edgeslam_torch.geometry.camera import Camera
@@ -37,16 +37,12 @@ def test_camera_of_rendered_chessboards_is_found(rng):
     result = calibrate(views(rng, chessboard(), 14), Board(8, 6))
     camera = result.camera
     assert camera.fx == pytest.approx(CAMERA.fx, rel=0.005)
+    assert 1e-4 < camera.focal_sigma < 0.02 and abs(camera.fx / CAMERA.fx - 1.0) < 4.0 * camera.focal_sigma
     assert camera.fy == pytest.approx(CAMERA.fy, rel=0.005)
     assert camera.cx == pytest.approx(CAMERA.cx, abs=3.0)
     assert camera.cy == pytest.approx(CAMERA.cy, abs=3.0)
     assert result.rms_px < 0.2
     assert len(result.used) >= 10
-
-
-def test_size_of_the_board_is_found_by_trying(rng):
-    pictures = [image for _, image in views(rng, chessboard(7, 5), 3)]
-    assert board_size(pictures) == (7, 5)
 
 
 def test_charuco_board_is_found_even_when_partly_out_of_sight(rng):
@@ -80,13 +76,6 @@ def test_aprilgrid_is_found_whatever_its_order_and_border(rng, border, upwards, 
     result = calibrate(views(rng, picture, 6, width_m=0.4), Board(6, 5, tag_spacing=0.3))
     assert result.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
     assert result.rms_px < 0.3
-
-
-def test_the_file_says_how_well_the_focal_length_is_known(rng):
-    result = calibrate(views(rng, chessboard(), 12), Board(8, 6))
-    off = abs(result.camera.fx / CAMERA.fx - 1.0)
-    assert 1e-4 < result.camera.focal_sigma < 0.02
-    assert off < 4.0 * result.camera.focal_sigma
 
 
 @pytest.mark.parametrize("kind", ["video", "recording"])
@@ -147,19 +136,6 @@ def test_few_or_flat_views_are_doubted(rng):
         calibrate(pictures, Board(8, 6))
 
 
-def test_no_board_at_all_is_an_error_that_says_what_to_do(rng):
-    with pytest.raises(CalibrationError, match="--board"):
-        calibrate([("noise.png", rng.integers(0, 255, (120, 160), dtype=np.uint8))], Board(8, 6))
-    with pytest.raises(CalibrationError, match="0 usable"):
-        calibrate([], Board())
-
-
-@pytest.mark.parametrize("wrong", [{"columns": 2, "rows": 6}, {"square_m": 0.0}, {"charuco": True}])
-def test_impossible_boards_are_refused(wrong):
-    with pytest.raises(CalibrationError):
-        Board(**wrong)
-
-
 def test_command_writes_a_file_that_every_command_reads(rng, tmp_path, capsys):
     (tmp_path / "in").mkdir()
     for name, image in views(rng, chessboard(), 8):
@@ -174,14 +150,6 @@ def test_command_writes_a_file_that_every_command_reads(rng, tmp_path, capsys):
     assert "broken.png: cannot be decoded" in text
     assert "bomb.pgm: image is 17000x17000" in text
     assert "reprojection error" in text
-
-
-def test_pictures_that_cannot_be_read_are_named_when_too_few_are_left(tmp_path, capsys):
-    (tmp_path / "bomb.pgm").write_bytes(b"P5 17000 17000 255\n")
-    assert main(["calibrate", str(tmp_path), "--board", "8x6", "--out", str(tmp_path / "c.yaml")]) == 1
-    said = capsys.readouterr().err
-    assert "1 could not be read (the first: " in said
-    assert "bomb.pgm: image is 17000x17000" in said
 
 
 @pytest.mark.parametrize(

@@ -42,14 +42,6 @@ def test_given_camera_is_kept(recording):
     assert source.camera is before
 
 
-def test_live_source_is_not_touched(recording):
-    source = open_source(recording)
-    source.live = True
-    before = source.camera
-    settle_camera(source)
-    assert source.camera is before
-
-
 def test_too_few_images_keep_the_guess_and_its_warning(recording):
     source = open_source(recording, max_frames=2)
     settle_camera(source)

@@ -95,14 +95,6 @@ def test_a_program_that_hangs_has_its_sticks_centred_and_then_is_landed(quick):
     assert guard.is_done()
 
 
-def test_centred_sticks_are_left_alone_while_the_program_hangs(quick):
-    guard = Watched()
-    guard.tell(b"p.")
-    assert [guard.hear(), guard.hear()] == [CENTRED, LAND]  # the landing's own
-    os.close(guard.pipe)
-    assert guard.is_done()
-
-
 class Loud:
     """A socket that receives repeated early ``ok`` datagrams."""
 

@@ -69,20 +69,6 @@ def check_folder(folder):
     return len(frames)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-def test_a_signal_lands_the_drone_and_leaves_a_whole_recording(tmp_path, number):
-    with emulated() as (emulator, url), recording(url, tmp_path / "flight") as process:
-        until(lambda: flying(emulator))
-        process.send_signal(number)
-        said, errors = process.communicate()
-        assert on_the_floor(emulator)  # before the program was gone
-        assert "land" in emulator.heard
-    assert process.returncode == 128 + number
-    assert errors == ""
-    frames = check_folder(tmp_path / "flight")
-    assert f"{frames} frames" in said
-
-
 class SlowStarter(SwiftDrone):
     """Its rotors spin up for two seconds after ``takeoff``; until then it reports to be on the floor."""
 
@@ -145,7 +131,7 @@ def test_ctrl_c_again_and_again_does_not_end_the_landing(tmp_path):
     check_folder(tmp_path / "flight")
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGABRT, signal.SIGSEGV, signal.SIGUSR1])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
 def test_a_program_that_is_shot_still_lands(tmp_path, number):
     with emulated() as (emulator, url), recording(url, tmp_path / "flight") as process:
         until(lambda: flying(emulator))

@@ -9,7 +9,7 @@ import pytest
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.errors import OutputError
-from edgeslam_torch.files.output_file import add_overwrite, check_new, check_outputs, output_file
+from edgeslam_torch.files.output_file import add_overwrite, check_outputs, output_file
 from edgeslam_torch.writers.run_writer import OUTPUTS
 
 
@@ -74,11 +74,6 @@ def test_what_is_read_is_never_replaced(parser, tmp_path, monkeypatch, spelling)
 def test_two_results_need_two_files(parser, tmp_path):
     with pytest.raises(OutputError, match="twice"):
         _check(parser, "in", "--json", tmp_path / "a", "-m", tmp_path / "." / "a")
-
-
-def test_a_folder_is_no_file(tmp_path):
-    with pytest.raises(OutputError, match="folder"):
-        check_new(tmp_path, overwrite=True)
 
 
 @pytest.mark.parametrize(

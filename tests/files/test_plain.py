@@ -56,13 +56,6 @@ def test_what_goes_on_in_a_file_goes_on_in_no_link(theirs, name, link):
     assert theirs.read_text() == "theirs"
 
 
-@pytest.mark.parametrize("name", REPLACING)
-def test_a_link_to_nothing_makes_nothing_there(tmp_path, name):
-    (tmp_path / "a.png").symlink_to(tmp_path / "nothing.png")
-    REPLACING[name](tmp_path / "a.png")
-    assert not (tmp_path / "nothing.png").exists()
-
-
 @pytest.mark.parametrize("name", [*REPLACING, *KEEPING])
 def test_a_pipe_is_refused_and_does_not_hang(tmp_path, name):
     os.mkfifo(tmp_path / ".lock")
@@ -98,10 +91,3 @@ def test_a_lock_of_a_killed_run_is_taken(tmp_path, text):
     assert (tmp_path / ".lock").read_text().startswith(f"process {os.getpid()} ")
     lock.release()
     assert not (tmp_path / ".lock").exists()
-
-
-def test_a_lock_of_another_program_stays(tmp_path):
-    (tmp_path / ".lock").write_text("of another program")
-    with pytest.raises(OutputError, match="--out"):
-        FolderLock(tmp_path)
-    assert (tmp_path / ".lock").read_text() == "of another program"

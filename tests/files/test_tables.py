@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.files.tables import number, read_table
+from edgeslam_torch.files.tables import read_table
 from edgeslam_torch.files.time_units import UNKNOWN, seconds_of
 
 ROWS = [[1305031102.175, 1.5, -2.0], [1305031102.21, 0.25, 3.0]]
@@ -42,11 +42,6 @@ def test_decimal_commas(tmp_path, separator, quote):
     assert [row.cells[3] for row in table.rows] == ["rgb/a.png"] * 2
 
 
-def test_quoted_numbers_with_decimal_commas_between_commas(tmp_path):
-    path = written(tmp_path, '"t","x"\n"1,5","2,25"\n"2,5","3"\n')
-    assert read_table(path, SourceError).numbers().tolist() == [[1.5, 2.25], [2.5, 3.0]]
-
-
 @pytest.mark.parametrize(
     "line", ["{} rgb/a b.png", "{}\trgb/a b.png", "{},rgb/a b.png", "{};rgb/a b.png", '{},"rgb/a b.png"']
 )
@@ -55,18 +50,6 @@ def test_the_last_of_two_columns_is_text_with_blanks(tmp_path, line):
         written(tmp_path, "\n".join(line.format(x, "rgb/a b.png") for x in ("1.0", "1.5"))), SourceError, columns=2
     )
     assert [row.cells for row in table.rows] == [["1.0", "rgb/a b.png"], ["1.5", "rgb/a b.png"]]
-
-
-def test_a_separator_at_the_end_of_each_row_adds_no_column(tmp_path):
-    assert read_table(written(tmp_path, "a,b\n1,2,\n3,4,\n"), SourceError).numbers().shape == (2, 2)
-    assert read_table(written(tmp_path, "a,b,c\n1,2,\n3,4,\n"), SourceError).rows[0].cells == ["1", "2", ""]
-
-
-def test_header_of_a_data_set(tmp_path):
-    text = "#timestamp [ns], p_RS_R_x [m], q_RS_w []\n1403636580838555648, 4.68, 0.5\n"
-    table = read_table(written(tmp_path, text), SourceError)
-    assert table.header == ("timestamp [ns]", "p_RS_R_x [m]", "q_RS_w []")
-    assert table.numbers()[0, 0] == 1403636580838555648
 
 
 @pytest.mark.parametrize(
@@ -91,11 +74,6 @@ def test_an_incomplete_last_row_is_left_out_and_size_is_bounded(tmp_path):
     assert len(read_table(path, SourceError).numbers()) == 2
     with pytest.raises(SourceError, match="MB"):
         read_table(path, SourceError, max_bytes=5)
-
-
-@pytest.mark.parametrize("text", ["", "1_000", "12cm", "1.000,5", "1,2,3", ",", "x"])
-def test_what_is_no_number(text):
-    assert number(text) is None
 
 
 @pytest.mark.parametrize("factor,unit", [(1.0, "s"), (1e3, "ms"), (1e6, "us"), (1e9, "ns")])

@@ -31,11 +31,6 @@ def test_every_folder_and_video_of_a_folder_is_a_flight(recordings):
     assert names(recordings) == ["a", "b", "broken", "clip.mp4"]
 
 
-def test_recording_itself_is_one_flight(recordings):
-    assert names(recordings / "a") == ["a"]
-    assert names(recordings / "clip.mp4") == ["clip.mp4"]
-
-
 def test_pattern_names_flights(recordings):
     assert names(recordings / "[ab]") == ["a", "b"]
     with pytest.raises(SourceError, match="no folder or video matches"):
@@ -63,12 +58,6 @@ def test_table_gives_each_flight_its_own_camera_truth_and_settings(tmp_path):
     assert (second.camera, second.truth) == (str(tmp_path / "c.yaml"), str(tmp_path / "t.txt"))
 
 
-def test_table_names_the_topics_of_a_bag(tmp_path):
-    rows = "recording,topic\na.bag,/cam1/image_raw\nb.mcap,/cam0/image_raw odom=/vio\nc,\n"
-    flights = read_manifests([str(table(tmp_path, rows))])
-    assert [flight.topics for flight in flights] == [("/cam1/image_raw",), ("/cam0/image_raw", "odom=/vio"), ()]
-
-
 def test_name_cannot_leave_the_batchs_folder(tmp_path):
     flights = read_manifests([str(table(tmp_path, 'recording,name\na,../../etc\nb,"a b/c"\nc,..\n'))])
     assert [flight.name for flight in flights] == ["etc", "a_b_c", "flight"]
@@ -89,15 +78,6 @@ def test_name_cannot_leave_the_batchs_folder(tmp_path):
 def test_malformed_table_is_refused_with_its_line(tmp_path, text, message):
     with pytest.raises((ConfigError, SourceError), match=message):
         read_manifests([str(table(tmp_path, text))])
-
-
-def test_what_is_not_there_is_named(tmp_path):
-    with pytest.raises(SourceError, match="nowhere: no such folder, recording or table"):
-        names(tmp_path / "nowhere")
-    with pytest.raises(SourceError, match="no folders or videos in it"):
-        names(tmp_path)
-    with pytest.raises(SourceError, match="not live sources"):
-        names("webcam:0")
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t"])

@@ -1,4 +1,4 @@
-"""Pinhole camera: projection, distortion, resizing. Files are in test_camera_files.py."""
+"""Pinhole camera: projection, distortion, resizing."""
 
 import cv2
 import numpy as np

@@ -5,11 +5,10 @@ import select
 import subprocess
 import sys
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 
-from edgeslam_torch.jobs.watched import How, Job, Limits, last_words, resident_mb, run_each
+from edgeslam_torch.jobs.watched import How, Job, Limits, resident_mb, run_each
 
 LIMITS = Limits(timeout_s=60.0)
 LARGE = "import time; b = bytearray(300 << 20); b[::4096] = b'x' * len(b[::4096]); time.sleep(60)"
@@ -85,13 +84,6 @@ def test_process_ends_with_the_one_that_holds_its_stdin():
     assert child.wait(timeout=30) == 1
 
 
-def test_process_that_waits_for_its_parent_ends_well_by_itself(tmp_path):
-    code = "from edgeslam_torch.jobs.watched import end_with_parent; end_with_parent()"
-    child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
-    assert child.wait(timeout=30) == 0
-    child.stdin.close()
-
-
 POOL = """
 import os, time
 from concurrent.futures import ProcessPoolExecutor
@@ -119,12 +111,3 @@ def test_a_pools_worker_ends_with_the_process_that_started_it(tmp_path):
     ended, _, _ = select.select([worker], [], [], 30.0)
     os.close(worker)
     assert ended
-
-
-def test_last_line_says_why(tmp_path):
-    log = tmp_path / "log"
-    log.write_text("begun\nno such file\n\n")
-    assert last_words(log, 1) == "no such file (exit code 1)"
-    assert last_words(log, -11) == "no such file (killed by signal 11)"
-    Path(log).write_text("")
-    assert last_words(log, 2) == "exit code 2"

@@ -38,11 +38,6 @@ def test_a_jpeg_is_read_in_grey_and_in_colour_when_asked(entry):
     assert abs(off.mean()) < 0.5
 
 
-def test_a_grey_jpeg_stays_grey(entry):
-    frame = read_frame(entry("a.jpg", picture()[:, :, 0]))
-    np.testing.assert_array_equal(frame.image, frame.grey)
-
-
 def test_another_format_is_decoded_once(entry):
     frame = read_frame(entry("a.png", picture()))
     np.testing.assert_array_equal(frame.image, picture())
@@ -112,13 +107,6 @@ def test_an_image_of_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, m
     assert list(frames_of([ImageEntry(0, 0.0, path)], (64, 48), problems)) == []
     assert problems[0].reason == reason
     assert pixels_or_none(path, -1) is None
-
-
-def test_a_file_too_large_for_an_image_is_not_read(tmp_path):
-    with (tmp_path / "a.png").open("wb") as file:
-        file.truncate(1 << 40)
-    with pytest.raises(SourceError, match="a.png: 1099512 MB is too large for an image"):
-        read_image(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])

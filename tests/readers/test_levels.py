@@ -46,11 +46,6 @@ def test_pictures_of_a_closed_shutter_do_not_set_the_range(odd):
     assert levels_of(iter([*shut, *[thermal] * 12])) == levels_of([thermal] * 10)
 
 
-def test_noise_of_a_first_picture_beyond_the_others_does_not_set_the_range():
-    thermal = (7000 + 1.5 * GREY).astype(np.uint16)
-    assert levels_of([(GREY / 20).astype(np.uint16), *[thermal] * 4]) == levels_of([thermal] * 4)
-
-
 def test_eight_bits_stay_and_colour_is_one_range():
     assert np.array_equal(Levels(10.0, 20.0, "").eight_bits(GREY.astype(np.uint8)), GREY)
     colour = np.stack([16 * GREY, 8 * GREY, 0 * GREY], axis=2).astype(np.uint16)

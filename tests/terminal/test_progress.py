@@ -15,7 +15,7 @@ from fake_slam import FakeSlam
 
 from edgeslam_torch.terminal import progress as module
 from edgeslam_torch.terminal.console import Console
-from edgeslam_torch.terminal.progress import Progress, counted
+from edgeslam_torch.terminal.progress import Progress
 from edgeslam_torch.terminal.run_progress import RunProgress
 from edgeslam_torch.types import Frame
 
@@ -54,15 +54,6 @@ def test_a_line_every_five_seconds_where_there_is_no_terminal():
 
 def test_what_was_done_before_is_no_part_of_the_rate():
     assert re.search(r"91 of 100 steps, 0\.2 steps/s, 45 s left", lines(100, 90, 5.0)[0])
-
-
-def test_slow_work_is_not_repeated_word_for_word():
-    clock, stream = Clock(), io.StringIO()
-    with Progress("last refinement", stream=stream, clock=clock) as progress:
-        for _ in range(10):
-            clock.now += 60.0
-            progress.show()
-    assert stream.getvalue() == "edgeslam: last refinement\n"
 
 
 @pytest.mark.parametrize("columns", [0, 30, 200])
@@ -115,32 +106,11 @@ def test_work_within_work_is_shown_alone():
         assert "outer" in stream.getvalue()
 
 
-def test_other_processes_of_a_group_are_silent():
-    stream = io.StringIO()
-    with Progress("training", redraw=True, shown=False, stream=stream) as progress:
-        progress.show()
-    assert stream.getvalue() == ""
-
-
 def test_a_closed_terminal_does_not_end_the_work():
     stream = io.StringIO()
     stream.write = lambda text: (_ for _ in ()).throw(OSError(errno.EIO, "gone"))
     with Progress("work", redraw=True, stream=stream) as progress:
         progress.show()
-
-
-def test_counted_gives_the_items():
-    assert list(counted(["a", "b"], "reading", "image")) == ["a", "b"]
-
-
-def test_downloads_are_shown_in_megabytes():
-    clock = Clock()
-    with Progress("file", unit="MB", stream=io.StringIO(), clock=clock) as progress:
-        clock.now += 2.0
-        progress.downloaded(3_000_000, 12_000_000)
-        assert progress.text() == "file, 3.0 of 12.0 MB, 1.5 MB/s, 6 s left"
-        progress.downloaded(3_000_000, 0)
-        assert progress.text() == "file, 3.0 MB, 1.5 MB/s"
 
 
 def test_a_run_shows_frames_pose_distance_and_the_last_refinement():

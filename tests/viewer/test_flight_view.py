@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.errors import OutputError
 from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
@@ -70,9 +69,3 @@ def test_a_revised_unit_begins_the_way_anew(view):
     flight_controller.order(state(1.0, 0.5, revision=1))
     last = view._stream.shown["world/flown"][-1]
     assert len(last.strips.as_arrow_array().to_pylist()[0]) == 1
-
-
-def test_a_file_that_cannot_be_written_is_said(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot be written"):
-        FlightView("test", tmp_path / "file" / "flight.rrd")

@@ -43,9 +43,3 @@ def test_unknown_depth_is_black_and_a_picture_of_nothing_says_so():
     nothing = colour(np.full((40, 100), np.nan, np.float32))
     assert (nothing[:40] == 0).all()
     assert len(np.unique(cv2.cvtColor(nothing[40:], cv2.COLOR_BGR2GRAY))) > 3  # words
-
-
-@pytest.mark.parametrize("metres", [0.05, 0.3, 2.0, 77.7, 200.0])
-@pytest.mark.parametrize("width", [1, 20, 640])
-def test_one_depth_everywhere_is_drawn(metres, width):
-    assert colour(np.full((4, width), metres, np.float32)).shape == (4 + BAR_PX + LABELS_PX, width, 3)

@@ -18,7 +18,7 @@ from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.types import Observations, PointCloud
 from edgeslam_torch.writers.maps.colmap import write_colmap
 from edgeslam_torch.writers.maps.directions import edge_directions
-from edgeslam_torch.writers.maps.nerfstudio import sparse_depth, valid_pixels, write_nerfstudio
+from edgeslam_torch.writers.maps.nerfstudio import valid_pixels, write_nerfstudio
 from edgeslam_torch.writers.maps.pcd import write_pcd
 from edgeslam_torch.writers.observations import read_observations, write_observations
 from edgeslam_torch.writers.ply import write_ply
@@ -75,13 +75,6 @@ def test_colmap_links_points_to_the_pixels_that_saw_them(anchors, seen, tmp_path
     assert found["worst_px"] < 0.02, "pixels have three decimals, points six digits"
 
 
-def test_observations_come_back_as_they_were(seen, tmp_path):
-    write_observations(tmp_path / "o.npz", seen)
-    again = read_observations(tmp_path / "o.npz")
-    for name in ("stamps_s", "keyframe", "anchor", "uv"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(seen, name))
-
-
 @pytest.mark.parametrize("damage", ["missing", "text", "cut", "foreign", "short", "claim"])
 def test_damaged_observations_are_one_line(damage, seen, tmp_path):
     path = tmp_path / "o.npz"
@@ -127,13 +120,6 @@ def test_nerfstudio_sees_each_anchor_where_the_image_has_it(anchors, seen, tmp_p
     assert (tmp_path / "n" / scene["ply_file_path"]).is_file()
 
 
-def test_nearest_of_two_points_of_a_pixel_is_its_depth():
-    p_w = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 1.5], [0.0, 0.0, -1.0]])
-    uv = np.tile([[CAMERA.cx, CAMERA.cy]], (3, 1))
-    depth = sparse_depth(CAMERA, np.eye(4), p_w, uv)
-    assert depth.max() == 1500 and np.count_nonzero(depth) == 1
-
-
 def test_mask_is_black_where_the_lens_showed_nothing():
     pinhole = replace(CAMERA, distortion=(0.0,) * 5)
     assert valid_pixels(pinhole).min() == 255
@@ -175,8 +161,3 @@ def test_no_format_follows_a_link(anchors, tmp_path):
         (tmp_path / name).symlink_to(tmp_path / "other")
         write(tmp_path / name, anchors)
         assert (tmp_path / "other").read_text() == "other" and not (tmp_path / name).is_symlink()
-
-
-def test_nerfstudio_needs_the_images(tmp_path, anchors, seen):
-    with pytest.raises(SourceError, match=r"gone\.png: cannot be read"):
-        write_nerfstudio(tmp_path, CAMERA, [tmp_path / "gone.png"] * 2, POSES, anchors, anchors, seen)

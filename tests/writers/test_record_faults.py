@@ -62,16 +62,6 @@ def record(url, folder, *options):
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_one_packet_in_twenty_lost(tmp_path, capsys):
-    with emulated(loss=0.05) as (emulator, url):
-        assert record(url, tmp_path / "flight", "--max-frames", "60") == 0
-        assert on_the_floor(emulator)
-    assert "60 frames" in capsys.readouterr().out
-    check_flight(tmp_path / "flight", tmp_path, 60)
-
-
-@pytest.mark.slow
-@pytest.mark.alone
 def test_an_outage_of_three_seconds(tmp_path, capsys):
     with emulated() as (emulator, url):
 

@@ -24,16 +24,6 @@ def outputs(count):
     return slam, [slam.step(Frame(i, 100.0 + i / 30, image)) for i in range(count)]
 
 
-def test_rows_are_on_disk_before_the_next_frame(tmp_path):
-    writer = RunWriter(tmp_path / "out")
-    slam, frames = outputs(3)
-    for i, output in enumerate(frames):
-        writer.append(output, 2.5)
-        table = np.loadtxt(tmp_path / "out" / "trajectory.txt", ndmin=2)
-        assert table.shape == (i + 1, 8)
-    assert table[2, 0] == pytest.approx(100.0 + 2 / 30, abs=1e-6)
-
-
 def test_status_table_widens_for_a_stage_that_comes_later(tmp_path):
     writer = RunWriter(tmp_path)
     slam, frames = outputs(8)
@@ -123,11 +113,6 @@ def test_an_older_run_stays_until_the_first_frame_is_there_and_other_files_stay_
     assert np.loadtxt(tmp_path / "trajectory.txt", ndmin=2).shape == (1, 8)
 
 
-def test_folder_made_for_nothing_is_gone(tmp_path):
-    RunWriter(tmp_path / "out").close()
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize("name", [*OUTPUTS, "rgb.txt", "telemetry.csv", "sensor.yaml", "IMG_1.JPG", "flight.mp4"])
 def test_a_folder_with_what_no_run_wrote_is_refused_and_left_alone(tmp_path, name):
     (tmp_path / name).write_text("version: mine\n")
@@ -142,24 +127,6 @@ def test_a_recording_is_refused_although_a_run_of_old_wrote_into_it(tmp_path):
     (tmp_path / "rgb").mkdir()
     with pytest.raises(OutputError, match="holds rgb, which no run wrote"):
         RunWriter(tmp_path)
-
-
-@pytest.mark.parametrize("left", [["status.csv", "config.toml"], ["summary.json", "camera.yaml"]])
-def test_what_is_left_of_a_run_is_known_as_a_run(tmp_path, left):
-    leave_run(tmp_path / "run")
-    (tmp_path / "run" / "camera.yaml").write_text("")
-    for path in (tmp_path / "run").iterdir():
-        if path.name not in left:
-            path.unlink()
-    RunWriter(tmp_path / "run").close()
-
-
-def test_one_run_at_a_time(tmp_path):
-    first = RunWriter(tmp_path)
-    with pytest.raises(OutputError, match=f"process {os.getpid()} on .* since 20.* writes a run there"):
-        RunWriter(tmp_path)
-    first.close()
-    RunWriter(tmp_path).close()
 
 
 KILLED = """
@@ -185,12 +152,6 @@ def test_a_killed_run_leaves_no_lock_and_no_space_taken(tmp_path):
     (tmp_path / ".reserve").write_bytes(bytes(99))  # as version 0.1 left it
     leave_run(tmp_path)
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
-
-
-def test_source_folder_is_not_written_into(tmp_path):
-    with pytest.raises(OutputError, match="is the source itself"):
-        RunWriter(tmp_path, keep=[tmp_path])
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_full_disk_leaves_whole_lines_and_room_for_the_rest(tmp_path, monkeypatch):

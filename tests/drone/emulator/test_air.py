@@ -29,13 +29,6 @@ def test_wind_makes_a_hovering_drone_drift_as_far_as_its_controller_lets_it():
     assert drone.rpy()[0] > 0  # leans against it, to the right: positive roll with y left
 
 
-def test_still_air_gives_the_speed_asked_for():
-    drone = hovering()
-    drone.rc = (0.0, 0.5, 0.0, 0.0)
-    advance(drone, 5.0)
-    assert drone.velocity[0] == pytest.approx(0.5, abs=1e-3)
-
-
 def test_the_lean_follows_late():
     """63 % of the first lean after the attitude's time constant, before the velocity has changed much."""
     drone = hovering()

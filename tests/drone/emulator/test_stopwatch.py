@@ -16,11 +16,6 @@ def test_a_time_is_read_back_from_a_noisy_picture(rng, time_s):
     assert read_time(noisy) == pytest.approx(time_s)
 
 
-def test_a_picture_without_a_stopwatch_shows_no_time(rng):
-    assert read_time(rng.integers(0, 256, (720, 960, 3), dtype=np.uint8)) is None
-    assert read_time(np.full((720, 960, 3), 90, np.uint8)) is None
-
-
 def test_ages_pass_over_the_end_of_the_period():
     shown = 7 * PERIOD_S - 0.010
     assert age_s(shown % PERIOD_S, shown + 0.35) == pytest.approx(0.35)

@@ -36,10 +36,6 @@ def test_every_reading_of_the_imu_is_read(tmp_path):
     assert len(bag.imu()[0]) == len(readings)
 
 
-def test_none_is_read_when_the_user_says_so(tmp_path):
-    assert opened(tmp_path, series("/imu"), topics=["imu=none"]).imu()[0] is None
-
-
 def test_gyroscope_and_accelerometer_in_two_topics_become_one(tmp_path):
     bag = opened(
         tmp_path,

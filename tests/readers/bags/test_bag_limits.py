@@ -1,7 +1,6 @@
 """Bags made to hang, to take memory or to run code; and formats that only look strange."""
 
 import bz2
-import os
 import shutil
 import sqlite3
 
@@ -66,15 +65,6 @@ def test_a_split_recording_without_metadata_is_read_in_order(tmp_path, suffix):
             open_source(folder)
 
 
-@pytest.mark.timeout(20)
-@pytest.mark.parametrize("name", ["b.db3", "b.mcap"])
-def test_a_pipe_in_a_bags_folder_is_refused(tmp_path, name):
-    bags.write_ros2(tmp_path / "bag", _pictures(0, 3))
-    os.mkfifo(tmp_path / "bag" / name)
-    with pytest.raises(SourceError, match="not a regular file"):
-        open_source(tmp_path / "bag")
-
-
 def _mcap_of_ros1(path, profile, count, compression=True):
     from mcap.writer import CompressionType, Writer
     from ros1_bag import DEFINITION, _image
@@ -95,13 +85,6 @@ def _mcap_of_ros1(path, profile, count, compression=True):
 @pytest.mark.parametrize("profile", ["ros1", "", "other"])
 def test_mcap_of_ros1_or_without_a_profile_is_read(tmp_path, profile):
     _check_read(_mcap_of_ros1(tmp_path / "a.mcap", profile, 4), 4)
-
-
-def test_mcap_of_ros1_that_was_not_closed_is_refused_with_the_remedy(tmp_path):
-    path = _mcap_of_ros1(tmp_path / "a.mcap", "ros1", 4)
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(SourceError, match="mcap recover"):
-        list(open_source(path).frames())
 
 
 def test_a_bag_that_is_still_being_written_names_the_remedy(tmp_path):

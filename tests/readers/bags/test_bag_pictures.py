@@ -47,13 +47,6 @@ def test_twelve_bits_in_sixteen_of_both_byte_orders_keep_their_range():
         assert _read("mono16", values.astype(order).tobytes(), 4, 1, big=big).tolist() == [[0, 1, 255, 128]]
 
 
-def test_the_first_picture_sets_the_range_of_all():
-    decoder = PictureDecoder("x")
-    bright, dark = (np.full((2, 2), value, "<u2").tobytes() for value in (65535, 255))
-    assert decoder.decode(_message("mono16", bright, 2, 2)).max() == 255
-    assert decoder.decode(_message("mono16", dark, 2, 2)).max() == 0
-
-
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 @pytest.mark.parametrize("colour", [RED, GREEN, BLUE])
 @pytest.mark.parametrize("bits", [8, 16])
@@ -102,18 +95,6 @@ def test_what_is_no_picture_is_refused_in_one_line():
         _read("mono8", [0], 10**6, 10**6)
     with pytest.raises(SourceError, match="'h264'.*cannot be decoded"):
         PictureDecoder("x").decode(SimpleNamespace(format="h264", data=np.zeros(20, np.uint8)))
-
-
-@pytest.mark.parametrize(("encoding", "width", "height"), [("yuyv", 3, 3), ("uyvy", 1, 1), ("yuv422", 5, 1)])
-def test_sizes_that_an_encoding_cannot_have_are_refused_in_one_line(encoding, width, height):
-    with pytest.raises(SourceError, match=encoding):
-        _read(encoding, [128] * (2 * width * height), width, height)
-
-
-def test_a_row_of_four_gigabytes_in_one_line_costs_no_memory():
-    message = _message("mono8", [7] * 6, 6, 1)
-    message.step = 4_000_000_000
-    assert (PictureDecoder("x").decode(message) == 7).all()
 
 
 def test_compressed_pictures_are_checked_as_files_are():

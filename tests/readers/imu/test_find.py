@@ -91,13 +91,6 @@ def test_euroc_mount_is_the_relative_pose_of_both_sensors(tmp_path):
         assert model.time_offset_s == 0.0 and len(readings) == 400 and not said
 
 
-def test_what_is_not_stated_is_said_and_left_to_estimation(tmp_path):
-    (tmp_path / "imu.csv").write_text(HEADER + ROWS)
-    model, _, said = found(tmp_path)
-    assert model.T_imu_cam is None and model.time_offset_s is None and model.source == ImuModel().source
-    assert len(said) == 2 and "noise" in said[0] and "mount and clock" in said[1]
-
-
 def test_given_files_come_before_those_of_the_folder(tmp_path):
     (tmp_path / "imu.csv").write_text(HEADER + ROWS)
     (tmp_path / "imu.yaml").write_text(OURS)
@@ -137,12 +130,6 @@ def test_readings_of_another_flight_or_clock_are_not_used(tmp_path, span):
     assert none is None and readings is None and "stamped" in said
     with pytest.raises(EdgeSlamError, match="stamped"):
         found(tmp_path, Given(readings=tmp_path / "imu.csv"), span)
-
-
-def test_without_an_imu_there_is_no_warning(tmp_path):
-    assert found(tmp_path) == (None, None, [])
-    with pytest.raises(EdgeSlamError, match="readings"):
-        found(tmp_path, Given(model=tmp_path / "imu.yaml"))
 
 
 def test_written_files_give_the_same_readings_and_model(tmp_path, rng):

@@ -45,11 +45,6 @@ def test_evaluation_reads_the_same_clock(sequence):
     assert dataset.truth.stamped and dataset.camera is not None and dataset.camera.fy == 711.0
 
 
-def test_image_without_a_stamp_is_left_out_by_name(sequence, write_images):
-    write_images(sequence / "image_2", ["000004.png", "cover.png"])
-    assert [p.reason for p in open_source(sequence).problems] == ["its name is not a line of times.txt"] * 2
-
-
 def test_bad_files_are_named(sequence):
     (sequence / "calib.txt").write_text("P2: 1 2 x\n")
     with pytest.raises(CalibrationError, match=r"calib\.txt: no line 'P2:'"):
