@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 
-import cv2
 import numpy as np
 import pytest
 from fake_slam import FakeSlam
@@ -53,28 +52,6 @@ def test_run(edgeslam, recording, tmp_path):
     assert "units are metres" in out
     assert "camera.yaml" in err
     assert np.loadtxt(tmp_path / "out" / "trajectory.txt").shape == (6, 8)
-
-
-def test_what_was_never_tracked_was_not_never_lost(edgeslam, recording, tmp_path):
-    for image in (recording / "rgb").iterdir():
-        cv2.imwrite(str(image), np.zeros((48, 64), np.uint8))
-    code, out, _ = edgeslam("run", recording, "--out", tmp_path / "out", "--no-report")
-    assert code == 1, "nothing tracked is no success"
-    assert "0 of 6 frames tracked (0.0 %), " in out
-    assert "lost" not in out
-
-
-def test_a_part_of_a_recording_is_run(edgeslam, recording, tmp_path):
-    def stamps(name, *words):
-        assert edgeslam("run", recording, "-o", tmp_path / name, *words)[0] == 0
-        rows = (tmp_path / name / "status.csv").read_text().splitlines()
-        return [row.split(",")[rows[0].split(",").index("stamp_s")] for row in rows[1:]]
-
-    whole = stamps("whole")
-    assert stamps("part", "--start", "1", "--stride", "2", "--max-frames", "2") == whole[1:4:2]
-    code, _, err = edgeslam("run", recording, "-o", tmp_path / "none", "--start", "5000")
-    assert code == 1 and "5000" in err
-    assert edgeslam("run", "webcam:0", "--stride", "2")[0] == 1
 
 
 def test_settings_reach_the_resolved_config(edgeslam, recording, tmp_path):
@@ -173,12 +150,6 @@ def test_every_command_has_a_group_and_examples_that_parse():
     for name, lines in EXAMPLES.items():
         assert all(line in commands[name].format_help() for line in lines)
 
-
-@pytest.mark.parametrize("shell", ["bash", "zsh"])
-def test_completion_lists_commands_and_options(shell, edgeslam):
-    code, out, _ = edgeslam("--print-completion", shell)
-    assert code == 0 and "export-map" in out and "--save-atlas" in out
-
     # The folder may be there: the signal is raised again some milliseconds later, and loading may end before.
 
 
@@ -249,21 +220,6 @@ def test_closed_terminal_leaves_a_map(write_tum, tmp_path):
     assert child.wait() == 129
     assert (out / "edge_map.ply").is_file()
     assert json.loads((out / "summary.json").read_text())["ended_early"] == "interrupted"
-
-
-def test_a_recording_is_no_run_to_view_or_report(edgeslam, recording):
-    (recording / "groundtruth.txt").write_text("100.0 0 0 0 0 0 0 1\n100.1 0 0 0 0 0 0 1\n")
-    before = sorted(recording.iterdir())
-    for command in (("view", "--print"), ("report",)):
-        code, _, err = edgeslam(command[0], recording, *command[1:])
-        assert code == 1 and "no run wrote" in err
-    assert sorted(recording.iterdir()) == before
-
-
-@pytest.mark.parametrize("source", ["a" * 5000, "webcam:99999999999", "webcam:\u0663", "b/" * 3000])
-def test_impossible_sources_are_one_short_line(edgeslam, source):
-    code, _, err = edgeslam("run", source)
-    assert code == 1 and len(err.splitlines()) == 1 and len(err) < 3000
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")

@@ -72,11 +72,6 @@ def test_what_is_no_telemetry_is_refused_at_once(telemetry):
         slam.step(BGR, telemetry)
 
 
-def test_what_is_no_camera_is_refused_at_once():
-    with pytest.raises(TypeError, match="load_camera"):
-        EdgeSlam({"fx": 500.0})
-
-
 def test_steps_pair_each_frame_with_the_telemetry_since_the_last(tmp_path, write_images):
     write_images(tmp_path, [f"{k}.png" for k in range(4)])
     save_camera(tmp_path / "camera.yaml", CAMERA)

@@ -19,10 +19,9 @@ from edgeslam_torch.eval.inputs.run_folder import open_run
 from edgeslam_torch.files.config_file import load_config
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
-from edgeslam_torch.readers.pace import Counter, at_their_pace
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.run import AtlasFiles, run
-from edgeslam_torch.types import Frame, TelemetrySample
+from edgeslam_torch.types import TelemetrySample
 from edgeslam_torch.writers import run_summary
 from edgeslam_torch.writers.ply import read_ply
 
@@ -97,14 +96,6 @@ def test_what_the_system_warns_of_is_in_the_summary_beside_the_sources_warnings(
     assert summary["warnings"][-2:] == ["no calibration", "no depth"]
 
 
-def test_telemetry_of_another_time_is_a_warning_of_the_run(tmp_path, write_tum):
-    """Frames from 100 s on: what is stamped later never reaches the system, which cannot know that it is there."""
-    source, slam = open_source(write_tum(tmp_path / "seq", 4)), FakeSlam()
-    source.telemetry = [TelemetrySample(500.0 + 0.1 * k) for k in range(50)]
-    summary = run(source, tmp_path / "out", make_slam=fake(slam)).summary
-    assert any("stamped after the frames" in w for w in summary["warnings"])
-
-
 def test_lost_and_unreadable_frames_cost_coverage_and_are_counted(tmp_path, write_tum):
     folder = write_tum(tmp_path / "seq", 10)
     images = sorted((folder / "rgb").iterdir())
@@ -139,14 +130,6 @@ def test_telemetry_comes_with_the_frame_that_follows_it(tmp_path, write_tum):
     slam = FakeSlam()
     run(source, tmp_path / "out", make_slam=fake(slam))
     assert [[s.stamp_s for s in group] for group in slam.telemetry] == [[99.0, 100.0], [], [100.15, 100.2], []]
-
-
-def test_no_frame_at_all_is_an_error_that_says_why(tmp_path, write_tum):
-    folder = write_tum(tmp_path / "seq", 1)
-    source = open_source(folder)
-    next((folder / "rgb").iterdir()).write_bytes(b"")
-    with pytest.raises(SourceError, match="provided no frame.*empty file"):
-        run(source, tmp_path / "out", make_slam=fake(FakeSlam()))
 
 
 @pytest.mark.parametrize(("number", "times"), [(signal.SIGINT, 1), (signal.SIGTERM, 2), (signal.SIGHUP, 2)])
@@ -189,16 +172,6 @@ def test_a_run_that_comes_to_nothing_leaves_the_older_run(tmp_path, write_tum, e
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
 
 
-def test_second_ctrl_c_skips_the_refinement_and_still_writes(tmp_path, write_tum):
-    class Slow(FakeSlam):
-        def finish(self):
-            os.kill(os.getpid(), signal.SIGINT)
-            os.kill(os.getpid(), signal.SIGINT)
-
-    result = run(open_source(write_tum(tmp_path / "seq", 5)), tmp_path / "out", make_slam=fake(Slow()))
-    assert {p.name for p in result.folder.iterdir()} == FILES
-
-
 def test_ctrl_c_while_a_live_source_is_silent(tmp_path, write_tum):
     source = open_source(write_tum(tmp_path / "seq", 3))
     recorded = source.frames
@@ -214,26 +187,6 @@ def test_ctrl_c_while_a_live_source_is_silent(tmp_path, write_tum):
     result = run(source, tmp_path / "out", make_slam=fake(FakeSlam()))
     assert result.interrupted
     assert result.summary["frames"] == 2
-
-
-def frames_at(stamps):
-    image = np.zeros((4, 4), np.uint8)
-    return iter([Frame(i, stamp, image) for i, stamp in enumerate(stamps)])
-
-
-def test_realtime_keeps_pace_and_drops_the_oldest_waiting():
-    dropped = Counter()
-    frames = at_their_pace(frames_at(0.002 * i for i in range(50)), dropped, waiting=2)
-    first = next(frames)
-    until = time.monotonic() + 0.05
-    while time.monotonic() < until:
-        pass  # a slow step
-    rest = list(frames)
-    order = [frame.index for frame in (first, *rest)]
-    assert order == sorted(order)
-    assert 1 + len(rest) + dropped.value == 50
-    assert dropped.value > 5
-    assert rest[-1].index == 49
 
 
 def test_an_atlas_that_could_not_be_written_is_not_said_to_be_saved(tmp_path, write_tum, monkeypatch):

@@ -123,17 +123,6 @@ def test_blurred_images_without_matches_become_a_keyframe_only_when_the_view_lea
     assert statuses(outputs).count(FrameStatus.TRACKED) >= 9
 
 
-def test_health_says_what_the_newest_pose_is_worth():
-    slam, outputs = metric_run()
-    health = outputs[-1].health
-    assert slam.health() == health
-    assert (health.state, health.metric, health.stamp_s) == ("tracking", True, panels().stamps_s[-1])
-    assert [s.source for s in health.sources] == ["depth"]
-    assert health.telemetry_age_s == np.inf
-    assert not health.filtering
-    assert EdgeSlam(CAMERA, NO_NETWORK).health() is None
-
-
 def test_present_pose_without_a_drone_goes_on_at_constant_velocity():
     slam, outputs = metric_run()
     a, b = outputs[-2], outputs[-1]
@@ -234,14 +223,6 @@ def test_two_runs_give_the_same_bytes():
 
 
 # -- how it starts -----------------------------------------------------------------------------------------------
-
-
-def test_first_camera_turns_as_the_drone_says():
-    """Facing left, nose level: the camera looks along y and down by its tilt, and the world's z is up."""
-    slam = EdgeSlam(CAMERA, NO_NETWORK)
-    sample = TelemetrySample(99.9, velocity_m_s=np.zeros(3), rpy_rad=np.array([0.0, 0.0, np.pi / 2]))
-    T = slam.step(panels().frames[0], [sample]).T_w_c
-    np.testing.assert_allclose(T[:3, 2], [0, np.cos(np.deg2rad(12)), -np.sin(np.deg2rad(12))], atol=1e-9)
 
 
 def test_the_world_is_upright_although_attitude_arrives_late():
@@ -489,14 +470,6 @@ def test_image_of_another_size_is_refused_by_name(shape, tmp_path):
     with pytest.raises(SourceError, match=rf"0001.png: image is {shape[1]}x{shape[0]}, the calibration 320x240"):
         slam.step(Frame(0, 0.0, np.zeros(shape, np.uint8), tmp_path / "0001.png"))
     assert slam.step(panels().frames[0]).status is FrameStatus.STARTING
-
-
-def test_metres_from_a_guessed_focal_length_say_that_it_is_one():
-    slam = EdgeSlam(replace(CAMERA, focal_sigma=0.45), NO_NETWORK, depth=panels().depth_function())
-    for frame in panels().frames[:20]:
-        slam.step(frame)
-    assert slam.scale.units is Units.METRES
-    assert slam.scale.sigma / slam.scale.value > 0.45
 
 
 def test_a_frozen_video_says_so_and_shows_no_motion():

@@ -13,15 +13,14 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from small_networks import RELATIVE, describe, green_network
+from small_networks import RELATIVE, green_network
 
 from edgeslam_torch.errors import ConfigError, EdgeSlamError
 from edgeslam_torch.frontend.depth_network import DepthPredictor, open_depth, weights_path
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
-from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Variant, Widths
-from edgeslam_torch.models.onnx.graph import build_graph
 from edgeslam_torch.models.onnx.presets import PRESETS
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.types import DepthMap
@@ -180,24 +179,7 @@ def test_download_says_how_far_a_file_can_be_trusted(tmp_path, capsys, monkeypat
         run("weights", "download", name)
 
 
-def test_inspect_reads_exported_files_and_shows_no_control_characters(weights, tmp_path, capsys):
-    network, metadata = load_checkpoint(weights)
-    loud = replace(metadata, notes="red \x1b[31m\nlicence: free", input_height=2048, input_width=2048, focal_px=1000.0)
-    save_checkpoint(network, loud, tmp_path / "loud.safetensors")
-    run("weights", "inspect", tmp_path / "loud.safetensors")
-    assert "notes: red \\x1b[31m\\nlicence: free" in capsys.readouterr().out
-    (tmp_path / "w.onnx").write_bytes(build_graph(weights)[0])
-    run("weights", "inspect", tmp_path / "w.onnx")
-    assert "focal_px: 105.0" in capsys.readouterr().out
-
-
 # -- networks of others --------------------------------------------------------------------------------------------
-
-
-def test_depth_maps_of_a_relative_network_would_have_no_unit(pictures, tmp_path):
-    network = describe(green_network(tmp_path / "n.onnx", **RELATIVE), 'preset = "midas-small"\n')
-    with pytest.raises(ConfigError, match="up to scale and shift"):
-        run("depth", pictures, "--out", tmp_path / "out", "--weights", network)
 
 
 def test_downloaded_network_is_ready_to_use(tmp_path, monkeypatch, capsys):
@@ -214,12 +196,3 @@ def test_downloaded_network_is_ready_to_use(tmp_path, monkeypatch, capsys):
     published.write_bytes(b"<html>not found</html>")
     with pytest.raises(EdgeSlamError, match="has changed since"):
         run("weights", "download", "midas-small")
-
-
-def test_a_missing_device_is_said_before_anything_is_written(weights, pictures, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    out = tmp_path / "out"
-    for words in (("depth", pictures, "--weights", weights), ("run", pictures, "--depth", weights)):
-        with pytest.raises(ConfigError, match="--device cuda: .*; use --device cpu"):
-            run(words[0], *words[1:], "--out", out, "--device", "cuda")
-        assert not out.exists() or not list(out.glob("*.npy")) + list(out.glob("trajectory.txt"))

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from published import png, tgz, zipped
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.datasets import catalogue, consent, store
-from edgeslam_torch.eval.benchmark import benchmark
 from edgeslam_torch.files.download import USER_AGENT
 from edgeslam_torch.readers.source import open_source
 
@@ -80,15 +78,6 @@ def test_recording_is_ready_to_run_and_says_where_it_comes_from(one, publisher, 
     assert (origin["licence"], origin["sha256"]) == ("L", sha256(content))
     assert [p.name for p in (tmp_path / "rec" / ".downloads").iterdir()] == ["a.tgz.sha256"], "the archive is gone"
     assert publisher.agents == {USER_AGENT}, "some servers refuse Python's own"
-
-
-def test_a_second_call_needs_no_consent(one, publisher, tmp_path, capsys):
-    one(tum())
-    assert get(tmp_path, "tum_fr1_a") == 0
-    publisher.requests.clear()
-    assert get(tmp_path, "tum_fr1_a") == 0
-    assert publisher.requests == []
-    assert "tum_fr1_a: is there" in capsys.readouterr().out
 
 
 def test_broken_download_goes_on_in_the_next_call(one, publisher, tmp_path, capsys):
@@ -165,14 +154,6 @@ def test_first_download_is_trusted_and_a_changed_second_one_is_not(one, publishe
     assert not target.exists()
 
 
-@pytest.mark.parametrize("bad", [b"<html>gone</html>", b"", tgz({"rgbd_dataset_freiburg1_xyz/readme": b"moved"})])
-def test_a_bad_first_answer_is_not_what_the_next_must_match(one, publisher, tmp_path, bad):
-    one(bad)
-    assert get(tmp_path, "tum_fr1_a") == 1
-    publisher.files["/a.tgz"] = tum()
-    assert get(tmp_path, "tum_fr1_a") == 0
-
-
 def test_archive_by_hand_is_checked_and_kept(one, tmp_path, capsys):
     content = tum()
     one(b"", checksum=f"sha256:{sha256(content)}", checksum_by="agreed")
@@ -212,13 +193,6 @@ def test_truth_of_its_own_archive_is_joined(shop, publisher, tmp_path):
     assert open_source(tmp_path / "rec" / "tartanair_me000").groundtruth is not None
 
 
-def test_disk_without_room_is_noticed_before_the_first_byte(one, publisher, tmp_path, capsys, monkeypatch):
-    one(tum(), bytes=10**18)
-    assert get(tmp_path, "tum_fr1_a") == 1
-    assert "of disk" in (said := capsys.readouterr()).out or "GB free" in said.err
-    assert publisher.requests == []
-
-
 def test_space_counts_an_archive_once_and_of_it_only_what_is_unpacked(shop, tmp_path):
     names = {f"s{i}": f"k/{i}.zip" for i in range(10)}
     shop({"urls": ["https://x/k.zip"], "bytes": 10_000_000_000, "sequences": names})
@@ -251,21 +225,6 @@ def test_licence_is_asked_for(one, publisher, tmp_path, monkeypatch, answer, cod
     monkeypatch.setattr(consent.sys, "stdin", Terminal())
     assert main(["data", "get", "tum_fr1_a", "--to", str(tmp_path / "rec")]) == code
     assert bool(publisher.requests) == (code == 0)
-
-
-def test_benchmark_runs_on_what_it_fetched(one, tmp_path, monkeypatch):
-    one(tum(40))
-    seen = {}
-
-    def run_benchmark(settings, out, say):
-        seen.update(data=settings.data, only=settings.only, found=benchmark.sequences(replace(settings, min_hz=0.5)))
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(benchmark, "run_benchmark", run_benchmark)
-    words = ["bench", "--get", "tum_fr1_a", "--agree", "--data", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]
-    assert main(words) == 130
-    assert seen["only"] == ("tum_fr1_a",)
-    assert seen["found"] == {"tum_fr1_a": tmp_path / "rec" / "tum_fr1_a"}
 
 
 @pytest.mark.parametrize("missing", [-1, 1])

@@ -4,9 +4,7 @@ import bz2
 import gzip
 import io
 import lzma
-import stat
 import tarfile
-import zipfile
 
 import pytest
 from published import tgz, zipped
@@ -33,10 +31,6 @@ def put(tmp_path):
 def test_named_folder_is_left_out_and_nothing_beside_it_is_taken(put):
     content = tgz({"./set/rgb.txt": b"1", "./set/rgb/1.png": b"22", "other/x": b"3"})
     assert put(content, "set") == {"rgb.txt": b"1", "rgb/1.png": b"22"}
-
-
-def test_folder_that_holds_everything_is_left_out(put):
-    assert put(tgz({"x/a": b"1", "x/b/c": b"2"})) == {"a": b"1", "b/c": b"2"}
 
 
 def test_archive_in_an_archive_is_unpacked_and_the_others_are_not(put, tmp_path):
@@ -67,16 +61,6 @@ def test_links_and_devices_in_a_tar_are_refused(put, tmp_path, kind):
     assert list((tmp_path / "target").iterdir()) == []
 
 
-def test_link_in_a_zip_is_refused(put):
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w") as archive:
-        info = zipfile.ZipInfo("rgb")
-        info.external_attr = (stat.S_IFLNK | 0o777) << 16
-        archive.writestr(info, "/etc")
-    with pytest.raises(SourceError, match="'rgb' is a link or a device"):
-        put(out.getvalue())
-
-
 def test_bomb_is_refused_before_it_is_unpacked(put, tmp_path):
     with pytest.raises(SourceError, match="too much for a recording"):
         put(tgz({"rgb.txt": bytes(40 << 20)}))
@@ -88,15 +72,6 @@ def test_damaged_archive_is_one_line(put, content):
     with pytest.raises(SourceError, match="damaged, or no archive") as caught:
         put(content)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("make", [zipped, tgz])
-def test_damaged_content_is_noticed(put, make, rng):
-    picture = rng.bytes(5000)  # as images do, it does not compress, so that only the checksum sees a changed byte
-    content = bytearray(make({"x/a": picture}))
-    content[content.find(picture[2000:2008])] ^= 1
-    with pytest.raises(SourceError, match="damaged"):
-        put(bytes(content))
 
 
 def test_one_file_by_the_end_of_its_path(tmp_path):

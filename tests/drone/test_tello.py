@@ -2,7 +2,6 @@
 
 import _thread
 import importlib
-import os
 import socket
 import threading
 from contextlib import closing
@@ -371,26 +370,6 @@ def test_no_answer_is_an_error_with_a_remedy():
         tello.connect()
 
 
-def test_refusals_of_the_drone_are_reported(emulate):
-    _, address = emulate()
-    with Tello(address) as tello:
-        tello.connect(PATIENCE_S)
-        with pytest.raises(TelloError, match="unknown command"):
-            tello.send("dance")
-        with pytest.raises(TelloError, match="not an SDK command"):
-            tello.send("battery?\nland")
-
-
-def test_stamps_follow_the_delay_of_the_video(emulate):
-    """Pictures and state share one clock: what the picture shows happened earlier, by the delay."""
-    emulator, address = emulate(link=LinkFaults(video_latency_s=0.4))
-    with Tello(address, allow_motion=True) as tello:
-        tello.connect(PATIENCE_S)
-        begin = tello.clock.now()
-        picture = tello.start_video().wait(0, PATIENCE_S)
-        assert picture.stamp_s - begin > 0.4
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -462,28 +441,6 @@ def test_djitellopy_flies_the_emulator(emulate, monkeypatch):
     assert emulator.drone.mode is Mode.GROUND
     assert drone.query_battery() > 90
     drone.end()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.environ.get("CI_NO_SOCKETS") == "1", reason="no sockets here")
-def test_recording_of_a_live_drone_is_a_flight_that_opens(emulate, tmp_path, capsys):
-    from edgeslam_torch.cli import main
-    from edgeslam_torch.readers.source import open_source
-
-    emulator, a = emulate()
-    url = f"tello://127.0.0.1:{a.command_port}:{a.state_port}:{a.video_port}"
-    folder = tmp_path / "flight"
-    assert main(["record", url, "--out", str(folder), "--max-frames", "40", "--fly"]) == 0
-    assert emulator.drone.mode is Mode.GROUND
-    source = open_source(folder)
-    frames = list(source.frames())
-    assert len(frames) == 40
-    assert source.kind == "flight"
-    assert len(source.telemetry) > 5
-    assert source.telemetry[0].stamp_s < frames[-1].stamp_s
-    assert (folder / "state.txt").read_text().count("bat:") == len(source.telemetry)
-    assert main(["record", url, "--out", str(folder), "--max-frames", "5"]) == 1
-    assert "already" in capsys.readouterr().err
 
 
 def test_lands_whatever_ends_the_flight(emulate):

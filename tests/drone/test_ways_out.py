@@ -177,21 +177,6 @@ def test_the_terminal_is_closed(tmp_path):
     check_folder(tmp_path / "flight")
 
 
-def test_a_closed_pipe_ends_quietly(tmp_path):
-    """``edgeslam record --fly | head -1``: the flight goes on, and ends as it is told."""
-    with emulated() as (emulator, url), recording(url, tmp_path / "flight") as process:
-        assert "focal length" in process.stdout.readline()
-        process.stdout.close()
-        process.stderr.close()
-        until(lambda: flying(emulator))
-        process.send_signal(signal.SIGTERM)
-        process.wait()
-        assert on_the_floor(emulator)
-        assert "land" in emulator.heard
-    assert process.returncode == 128 + signal.SIGTERM
-    check_folder(tmp_path / "flight")
-
-
 def test_the_disk_fills_up_in_flight(tmp_path):
     """Pictures from above half a metre are noise and larger than what the disk takes."""
     noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.eval.experiment.runner import Local
 from edgeslam_torch.fleet.batch import run_batch
 from edgeslam_torch.fleet.folder import BatchSettings
@@ -125,21 +125,3 @@ def test_mistake_in_one_flights_settings_is_found_before_any_is_run(tmp_path, re
     with pytest.raises(ConfigError, match=r"flights.csv, line 3: .*did you mean 'orb.features'"):
         batch(tmp_path, recordings, starter, manifest=manifest)
     assert starter.started == []
-
-
-def test_folder_of_something_else_is_refused(tmp_path, recordings):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "thesis.tex").touch()
-    with pytest.raises(OutputError, match=r"holds thesis.tex, which no batch wrote"):
-        batch(tmp_path, recordings, Starter())
-
-
-def test_page_is_escaped_and_needs_no_network(tmp_path, recordings, write_images):
-    write_images(recordings / "x<script>alert(1)", ["0.png"])
-    batch(tmp_path, recordings, Starter(c="import sys; sys.exit('<img src=x>')"))
-    page = (tmp_path / "out" / "index.html").read_text()
-    assert "<b>note" not in page
-    assert "<img src=x>" not in page
-    assert "http" not in page.replace("http-equiv", "")
-    assert 'data-key="0.02"' in page, "sorted by the figure, not by its rounded text"
-    assert str(tmp_path) not in page.replace(str(recordings), ""), "links are relative: the folder may be moved"

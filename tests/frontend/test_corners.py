@@ -120,37 +120,3 @@ def test_round_and_straight_contours_are_no_corners():
     cv2.ellipse(image, (450, 240), (120, 60), 30, 0, 360, 200, -1, cv2.LINE_AA)
     image[:, 600:] = 200
     assert len(detect(image)) == 0
-
-
-@pytest.mark.parametrize("image", [np.zeros((480, 640), np.uint8), np.full((64, 64), 255, np.uint8)])
-def test_an_image_without_edges_has_none(image):
-    found = detect(image)
-    assert len(found) == 0
-    assert found.arms.shape == (0, 2, 2)
-    assert found.arm_points(4)[0].shape == (0, 2, 4, 2)
-
-
-def turned_back(found, height):
-    """Corners of an image that was turned by 90 degrees anticlockwise, in the upright image."""
-    return np.stack([height - 1 - found.uv[:, 1], found.uv[:, 0]], 1)
-
-
-def check_turning(grey, least):
-    """Turning an image by a right angle moves no pixel value, so nearly all junctions must come again."""
-    found = detect(grey)
-    again = detect(np.ascontiguousarray(cv2.rotate(grey, cv2.ROTATE_90_COUNTERCLOCKWISE)))
-    back = turned_back(again, grey.shape[1])
-    assert len(found) >= least
-    distance = np.linalg.norm(found.uv[:, None] - back[None], axis=2).min(1)
-    assert (distance < 1.0).mean() > 0.8
-    assert np.median(distance[distance < 1.0]) < 0.2
-
-
-@pytest.mark.data
-@pytest.mark.parametrize("sequence", ["tum_fr1_xyz", "7scenes_redkitchen"])
-def test_turning_a_real_image_turns_its_junctions(sequence, data_dir):
-    images = sorted((data_dir / sequence).rglob("*.jpg"))
-    if not images:
-        pytest.skip(f"no images in {data_dir / sequence}")
-    for k in (0, len(images) // 2):
-        check_turning(cv2.imread(str(images[k]), cv2.IMREAD_GRAYSCALE), least=8)

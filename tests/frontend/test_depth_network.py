@@ -40,13 +40,6 @@ def test_backends_agree(weights, image):
     np.testing.assert_allclose(a.sigma_log, b.sigma_log, rtol=1e-3)
 
 
-def test_depth_follows_the_focal_length(weights, image):
-    """The same pixels through a lens 1.2 times as long are 1.2 times as far away."""
-    predictor = DepthPredictor(weights)
-    long = predictor(image, replace(CAMERA, fx=1.2 * CAMERA.fx, fy=1.2 * CAMERA.fy))
-    np.testing.assert_allclose(long.depth_m, 1.2 * predictor(image, CAMERA).depth_m, rtol=1e-5)
-
-
 def test_preprocessing_is_whole_image_rgb_in_minus_one_to_one():
     image = np.zeros((64, 64, 3), np.uint8)
     image[:, :32, 0] = 255  # left half blue
@@ -58,15 +51,6 @@ def test_preprocessing_is_whole_image_rgb_in_minus_one_to_one():
     np.testing.assert_allclose(x[0, 0], -1.0, atol=1e-6)
 
 
-def test_a_shrunk_image_is_not_rounded_to_grey_levels():
-    """Processors round a mean between two levels differently, and hence would see other depths."""
-    image = np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8)
-    mean = image.reshape(32, 2, 48, 2, 3).mean(axis=(1, 3))
-    assert np.mean(mean % 1.0 == 0.5) > 0.1
-    x = preprocess(image, 32, 48, Metadata())
-    np.testing.assert_allclose(x[0], np.moveaxis(mean[:, :, ::-1], 2, 0) / 127.5 - 1.0, atol=1e-6)
-
-
 @pytest.mark.parametrize("size", [(480, 640), (480, 752), (720, 960), (1080, 1920), (640, 480), (240, 320)])
 def test_network_input_has_the_images_shape_at_the_training_area(size):
     metadata = Metadata(input_height=192, input_width=256)
@@ -75,18 +59,6 @@ def test_network_input_has_the_images_shape_at_the_training_area(size):
     assert w % 32 == 0
     assert 0.6 * 192 * 256 <= h * w <= 192 * 256
     assert abs(np.log((w / h) / (size[1] / size[0]))) < 0.12
-
-
-def test_wrong_size_backend_and_files_are_rejected(weights, image, tmp_path):
-    with pytest.raises(ValueError, match="does not fit"):
-        DepthPredictor(weights)(image[:60], CAMERA)
-    with pytest.raises(ValueError, match="backend"):
-        DepthPredictor(weights, "tensorflow")
-    with pytest.raises(WeightsError, match="no such weights"):
-        DepthPredictor(tmp_path / "none.safetensors")
-    (tmp_path / "bad.onnx").write_bytes(b"not an onnx file")
-    with pytest.raises(WeightsError, match=r"bad\.onnx"):
-        DepthPredictor(tmp_path / "bad.onnx")
 
 
 def test_falls_back_to_torch_without_onnxruntime(weights, image, monkeypatch, caplog):

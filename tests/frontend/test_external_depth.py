@@ -11,7 +11,6 @@ from small_networks import FAR_M, NEAR_M, RELATIVE, describe, green_network, nod
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.frontend import depth_network
-from edgeslam_torch.frontend.depth_check import CheckedDepth
 from edgeslam_torch.frontend.depth_network import open_depth, weights_path
 from edgeslam_torch.frontend.external_depth import ExternalDepth
 from edgeslam_torch.geometry.camera import Camera
@@ -53,13 +52,6 @@ def test_every_output_type_gives_metres(tmp_path, image, gives, plane):
     np.testing.assert_allclose(found.depth_m[:, :80], 2 * NEAR_M, rtol=1e-5)  # a lens of twice the focal length
     np.testing.assert_allclose(found.depth_m[:, 112:], 2 * FAR_M, rtol=1e-5)
     np.testing.assert_allclose(found.sigma_log, 0.25)
-
-
-def test_sigma_is_the_networks_own_where_it_states_one(tmp_path, image):
-    nodes = [node("Mul", "depth tenth", "sigma")]
-    path = green_network(tmp_path / "net.onnx", nodes, "depth sigma", constants={"tenth": 0.1})
-    found = open_depth(describe(path, f'gives = "metres"\nsigma = "sigma"\n{SIZE}'))(image, CAMERA)
-    np.testing.assert_allclose(found.sigma_log, 0.1 * found.depth_m, rtol=1e-5)
 
 
 def test_relative_depth_is_right_up_to_scale_and_shift_of_its_inverse(tmp_path, rng):
@@ -122,43 +114,6 @@ def test_bad_description_is_one_line(tmp_path, words):
     with pytest.raises(WeightsError, match=words) as caught:
         open_depth(path)
     assert "\n" not in str(caught.value) and "net." in str(caught.value)
-
-
-def always(number):
-    """A network that gives one number, whatever it sees."""
-    nodes = [node("Mul", "depth none", "zero"), node("Add", "zero number", "out")]
-    return {"nodes": nodes, "output": "out", "constants": {"none": 0.0, "number": number}}
-
-
-ROWS = {"nodes": [node("Reshape", "depth rows", "out")], "output": "out"}
-
-
-@pytest.mark.parametrize(
-    ("network", "text", "words"),
-    [
-        ({"size": (64, 96)}, SIZE, "images of 64x96"),
-        ({"size": (4096, 4096)}, "", "input_height must be from"),
-        ({"channels": 4}, SIZE, r"expected \[1, 3, H, W\]"),
-        ({**ROWS, "constants": {"rows": np.array([1, 1, 126, -1])}}, SIZE, "cannot be run on 112x112 pixels"),
-        (always(np.nan), SIZE, "gives no depth"),
-        (always(-9.0), SIZE, "gives no depth"),
-        (always(2.0), SIZE, "the same depth for different images"),
-    ],
-)
-def test_network_that_cannot_give_depth_is_one_line(tmp_path, network, text, words):
-    path = describe(green_network(tmp_path / "net.onnx", **network), f'gives = "metres"\n{text}')
-    with pytest.raises(WeightsError, match=words):
-        open_depth(path)
-
-
-def test_non_finite_pixels_are_unknown(tmp_path, image):
-    """The logarithm of what is black after a shift is no number: those pixels alone have no depth."""
-    nodes = [node("Sub", "depth near2", "less"), node("Log", "less", "log"), node("Exp", "log", "again")]
-    path = green_network(tmp_path / "net.onnx", nodes, "again", constants={"near2": 2.0})
-    depth = CheckedDepth(ExternalDepth(describe(path, f'gives = "metres"\n{SIZE}')))
-    found = depth(image, CAMERA)
-    assert np.isnan(found.depth_m[:, :90]).all()
-    np.testing.assert_allclose(found.depth_m[:, 112:], FAR_M - 2.0, rtol=1e-4)
 
 
 # -- presets -------------------------------------------------------------------------------------------------------

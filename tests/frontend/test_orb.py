@@ -31,13 +31,6 @@ def test_faint_corners_are_found_with_few_others():
     assert found.faint
 
 
-def test_with_many_corners_faint_ones_change_nothing():
-    grey = views()[0][..., 1].copy()
-    config = OrbConfig(features=400)
-    a, b = (OrbExtractor(c, CAMERA)(grey) for c in (config, OrbConfig(features=400, fast_faint=12)))
-    np.testing.assert_array_equal(a.uv, b.uv)
-
-
 def test_keypoints_come_undistorted(rng):
     grey = patchwork(rng, 768, 900)[:480, :640, 0].copy()
     camera = PRESETS["tum_fr1"]

@@ -5,17 +5,8 @@ import pytest
 from point_map import PointMap
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.map.depth_prior import depth_prior, fit_to_anchors, sample
+from edgeslam_torch.map.depth_prior import depth_prior, fit_to_anchors
 from edgeslam_torch.types import DepthMap
-
-
-def test_sampling_takes_the_nearest_pixel_and_preserves_holes():
-    depth = np.array([[1.0, 2.0, 0.0], [4.0, np.nan, 6.0]], np.float32)
-    sigma = np.full((2, 3), 0.25, np.float32)
-    uv = np.array([[0.4, 0.4], [0.6, 0.0], [2.0, 0.0], [1.0, 1.0], [9.0, 9.0], [-3.0, 1.0]])
-    z, s = sample(DepthMap(depth, sigma), uv)
-    np.testing.assert_array_equal(z, [1.0, 2.0, np.nan, np.nan, 6.0, 4.0])
-    np.testing.assert_allclose(s, 0.25)
 
 
 def test_fit_returns_the_scatter_of_anchors(rng):
@@ -62,12 +53,6 @@ def test_neighbouring_anchors_replace_a_missing_network(points):
     assert prior.max() <= z.max() * 1.001
     # Smooth walls: what the prior claims as its sigma holds for two thirds.
     assert np.mean(np.abs(np.log(prior / z)) < 0.35) > 0.68
-
-
-def test_anchors_behind_the_camera_do_not_count(points):
-    keyframe = points.keyframes[0]
-    keyframe.T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ keyframe.T_c_w
-    assert np.isnan(depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors)[0]).all()
 
 
 @pytest.mark.parametrize(("twist", "sigma_log"), [(0.0, 0.051), (0.3, 0.061)])

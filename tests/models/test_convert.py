@@ -1,11 +1,9 @@
 """Upstream's pickled checkpoints: read without running them."""
 
-import argparse
 import os
 import sys
 import types
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -50,16 +48,6 @@ def test_whole_module_becomes_tensors(tmp_path, upstream_class, zipped):
     assert record.padding == "symmetric"
     x = torch.randn(1, 3, 32, 32)
     assert torch.equal(loaded(x), network(x))
-
-
-@pytest.mark.filterwarnings("ignore:Couldn't retrieve source")
-def test_what_training_left_beside_the_network_is_passed_over(tmp_path, upstream_class):
-    """As upstream's training script saves it: arguments, optimiser and all."""
-    network = upstream_class(FastDepth(Variant.PRUNED).eval())
-    optimiser = torch.optim.SGD(network.parameters(), 0.1, momentum=0.9)
-    content = {"args": argparse.Namespace(arch="x"), "epoch": 3, "best_result": np.float64(0.6), "optimizer": optimiser}
-    torch.save(content | {"model": network}, tmp_path / "w.pth.tar", _use_new_zipfile_serialization=False)
-    assert convert_upstream(tmp_path / "w.pth.tar", tmp_path / "out.safetensors").variant == Variant.PRUNED.value
 
 
 class _Hostile:

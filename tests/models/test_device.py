@@ -8,15 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from edgeslam_torch.config import DepthConfig
 from edgeslam_torch.errors import ConfigError, WeightsError
 from edgeslam_torch.frontend.depth_network import DepthPredictor, open_depth
 from edgeslam_torch.frontend.onnx_session import open_session
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
-from edgeslam_torch.models.device import find_device, onnx_providers
 from edgeslam_torch.models.fastdepth import Widths
-from edgeslam_torch.models.onnx.fold import deployed
 from edgeslam_torch.models.onnx.graph import build_graph
 from edgeslam_torch.models.record import Metadata
 
@@ -70,14 +67,6 @@ def onnxruntime_with(monkeypatch, *built_in, usable=CPU):
     return asked
 
 
-def test_auto_is_the_processor_where_there_is_nothing_else(weights, image, monkeypatch):
-    without_gpu(monkeypatch)
-    for backend in ("onnxruntime", "torch"):
-        auto, plain = (DepthPredictor(weights, backend, device=device) for device in ("auto", "cpu"))
-        assert auto.backend == backend
-        np.testing.assert_array_equal(auto(image, CAMERA).depth_m, plain(image, CAMERA).depth_m)
-
-
 @pytest.mark.parametrize("device", ["cuda", "mps"])
 @pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
 def test_a_device_that_is_not_there_is_refused_and_not_replaced(weights, backend, device, monkeypatch):
@@ -95,15 +84,6 @@ def test_an_onnx_file_needs_onnxruntimes_cuda(exported, monkeypatch):
         open_depth(exported, device="mps")
     with pytest.raises(WeightsError, match="runs in onnxruntime only"):
         open_depth(exported, "torch", device="cuda")
-
-
-@pytest.mark.parametrize("device", ["gpu", "cuda:1", ""])
-def test_other_names_are_refused(weights, device):
-    for ask in (find_device, onnx_providers, lambda name: open_depth(weights, device=name)):
-        with pytest.raises(ConfigError, match="there are auto, cpu, cuda, mps"):
-            ask(device)
-    with pytest.raises(ValueError, match="device must be auto, cpu, cuda or mps"):
-        DepthConfig(device=device)
 
 
 @pytest.mark.parametrize(
@@ -124,14 +104,6 @@ def test_a_silent_fallback_of_onnxruntime_is_reported(monkeypatch, caplog):
         open_session(b"", Path("x.onnx"), 1, "cuda")
     open_session(b"", Path("x.onnx"), 1, "auto")
     assert "depth runs on the processor" in caplog.text
-
-
-def test_the_deployed_network_leaves_nothing_on_the_processor():
-    """On the meta device, tensors have no values: one that was left elsewhere would not go with them."""
-    network = deployed(build_network(METADATA, SMALL), METADATA).to("meta")
-    log_depth, sigma = network(torch.zeros(1, 3, 64, 96, device="meta"))
-    assert log_depth.shape == sigma.shape == (1, 1, 32, 48)
-    assert log_depth.device.type == sigma.device.type == "meta"
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA here")

@@ -56,16 +56,6 @@ def server():
     httpd.server_close()
 
 
-def test_second_url_is_tried_and_checksum_returned(server, tmp_path):
-    seen = []
-    fetched = download(
-        (f"{server}/missing", f"{server}/file"), tmp_path / "w", progress=lambda have, total: seen.append((have, total))
-    )
-    assert (tmp_path / "w").read_bytes() == CONTENT
-    assert fetched.sha256 == hashlib.sha256(CONTENT).hexdigest()
-    assert seen[-1] == (len(CONTENT), len(CONTENT))
-
-
 def test_broken_transfer_goes_on_where_it_stopped(server, tmp_path):
     with pytest.raises(WeightsError, match="run it again"):
         download((f"{server}/short",), tmp_path / "w")

@@ -39,14 +39,6 @@ def test_seven_scenes_as_published(tmp_path, write_images):
     assert "7-Scenes" in source.warnings[0]
 
 
-def test_seven_scenes_frame_that_is_there_twice_is_used_once(tmp_path, write_images):
-    names = ["frame-000000.color.png", "frame-000001.color.png", "frame-000001.color.jpg", "frame-²2.color.png"]
-    write_images(tmp_path, names, (640, 480))
-    source = open_source(tmp_path)
-    assert [round(30 * f.stamp_s) for f in source.frames()] == [0, 1]
-    assert [p.frames for p in source.problems] == [1, 1]
-
-
 @pytest.mark.parametrize("level", ["", "mav0", "mav0/cam0"])
 def test_euroc_as_published(tmp_path, write_images, level):
     cam = tmp_path / "mav0" / "cam0"
@@ -122,12 +114,6 @@ def test_cut_off_video_gives_what_it_has(video):
     assert source.problems[-1].reason.endswith("of 8 frames; the file is damaged")
 
 
-def test_video_of_too_many_pixels_is_refused(video, monkeypatch):
-    monkeypatch.setattr("edgeslam_torch.readers.images.MAX_PIXELS", 64 * 48 - 1)
-    with pytest.raises(SourceError, match="clip.avi: image is 64x48, more than"):
-        open_source(video)
-
-
 # -- images that cannot be used ----------------------------------------------------------------------------------
 
 
@@ -145,16 +131,6 @@ def test_unusable_image_is_left_out_and_leaves_a_gap(tmp_path, write_images, suf
     source = open_source(tmp_path)
     assert [f.index for f in source.frames()] == [0, 1, 3]
     assert [p.file for p in source.problems] == [str(paths[2])]
-
-
-def test_malformed_lines_of_a_list_are_named(tmp_path, write_tum):
-    folder = write_tum(tmp_path, 3)
-    with (folder / "rgb.txt").open("a") as file:
-        file.write("what is this\n101.0\nnan rgb/x.png\n")
-    source = open_source(folder)
-    assert source.length == 3
-    assert len(source.problems) == 3
-    assert source.problems[0].file.endswith("rgb.txt:5")
 
 
 # -- sources that cannot be used ---------------------------------------------------------------------------------
@@ -185,13 +161,6 @@ def test_what_is_no_source_is_refused_with_the_reason(tmp_path, files, source, s
 # -- calibration -------------------------------------------------------------------------------------------------
 
 
-def test_calibration_of_another_resolution_is_scaled_and_says_so(tmp_path, write_tum):
-    source = open_source(write_tum(tmp_path, 2, (320, 240)), camera="kinect")
-    assert source.camera.fx == pytest.approx(262.5)
-    assert "scaled from 640x480 to 320x240" in source.camera.source
-    assert source.warnings
-
-
 def test_lens_that_turns_back_in_the_corners_is_used_with_a_warning(tmp_path, write_tum):
     folder = write_tum(tmp_path, 2)
     save_camera(folder / "camera.yaml", Camera(64, 48, 40.0, 40.0, 31.5, 23.5, (-0.3, 0.0, 0.0, 0.0, 0.0)))
@@ -207,15 +176,6 @@ def test_leaving_early_leaves_no_thread(tmp_path, write_tum):
     next(frames)
     frames.close()
     assert threading.active_count() == before
-
-
-@pytest.mark.data
-def test_real_sequence_opens_without_complaint(data_dir):
-    source = open_source(data_dir / "tum_fr1_xyz", max_frames=3)
-    frames = list(source.frames())
-    assert frames[0].stamp_s == pytest.approx(1305031102.175304)
-    assert frames[0].image.shape == (480, 640, 3)
-    assert (source.problems, source.warnings) == ([], [])
 
 
 def write_y4m(path, count):
@@ -234,19 +194,6 @@ def test_names_of_videos(tmp_path, suffix):
     raw = suffix.lower() in (".hevc", ".h265")
     assert any("are assumed" in problem.reason for problem in source.problems) == raw
     assert open_source(tmp_path).kind == "video"
-
-
-def test_the_small_copy_beside_a_video_is_no_second_one(tmp_path):
-    write_y4m(tmp_path / "GX010001.mp4", 3)
-    write_y4m(tmp_path / "GL010001.lrv", 2)
-    assert len(list(open_source(tmp_path).frames())) == 3
-
-
-def test_a_picture_beside_the_folder_of_images_is_not_the_recording(tmp_path, write_images):
-    write_images(tmp_path, ["title.png"])
-    write_images(tmp_path / "frames", [f"{i}.png" for i in range(5)])
-    with pytest.raises(SourceError, match="5 in its folder frames"):
-        open_source(tmp_path)
 
 
 def test_an_imu_beside_the_images_is_used_unless_the_user_says_otherwise(tmp_path, write_tum):

@@ -10,7 +10,6 @@ from edgeslam_torch.drone.sdk_state import FIELDS, parse_state, sample_from_sdk
 from edgeslam_torch.readers.telemetry_csv import (
     HEADER,
     TelemetryError,
-    TelemetryUnits,
     TelemetryWriter,
     detect_units,
     read_table,
@@ -36,18 +35,10 @@ def test_a_real_state_line_is_parsed():
     sample = sample_from_sdk(5.0, fields)
     assert sample.battery == pytest.approx(0.51)
     assert sample.baro_m == pytest.approx(147.94)
+    fields |= {"vgx": 5.0, "vgy": -2.0, "vgz": 1.0}
+    np.testing.assert_allclose(sample_from_sdk(0.0, fields).velocity_m_s, [0.5, 0.2, -0.1])  # SDK: right and down
     assert sample.acceleration_m_s2[2] == pytest.approx(9.846, abs=1e-3)  # specific force points up when level
     np.testing.assert_allclose(np.degrees(sample.rpy_rad), [-1.0, -3.0, 0.0])
-
-
-def test_sdk_1_3_form_is_parsed():
-    fields = parse_state(
-        "pitch:0;roll:0;yaw:10;vgx:5;vgy:-2;vgz:1;templ:60;temph:62;tof:90;h:80;bat:77;baro:1.5;time:9;"
-    )
-    sample = sample_from_sdk(0.0, fields)
-    np.testing.assert_allclose(sample.velocity_m_s, [0.5, 0.2, -0.1])  # forward, right, down to forward, left, up
-    assert np.degrees(sample.rpy_rad[2]) == pytest.approx(-10.0)  # clockwise to counter-clockwise
-    assert np.isnan(sample.acceleration_m_s2).all()
 
 
 @pytest.mark.parametrize(
@@ -86,19 +77,13 @@ def test_a_row_cut_by_a_crash_costs_only_that_row(tmp_path):
 
 
 def test_rows_without_order_or_numbers_are_skipped_and_counted(tmp_path):
-    path = write(tmp_path, "stamp_s,vgx,bat\n1,1,90\n1,2,90\nx,3,90\n2,,90\n0.5,4,90\n3,5\n\n# note\n4,6,90\n")
+    path = write(
+        tmp_path, "stamp_s,vgx,bat\n1,1,90\n1,2,90\nx,3,90\n2,,90\n0.5,4,90\n3,5\n\n# note\n1e300,7,90\n4,6,90\n"
+    )
     table = read_table(path)
     np.testing.assert_array_equal(table.stamps_s, [1.0, 2.0, 4.0])
-    assert table.skipped == 4
+    assert table.skipped == 5
     assert math.isnan(table.values["vgx"][1])
-
-
-@pytest.mark.parametrize("wild", ["99999", "-5", "inf", "1e300"])
-def test_a_wild_stamp_costs_one_row(tmp_path, wild):
-    rows = [f"{wild if i == 3 else i / 10},{i},90\n" for i in range(40)]
-    table = read_table(write(tmp_path, "stamp_s,vgx,bat\n" + "".join(rows)))
-    np.testing.assert_array_equal(table.values["vgx"], [i for i in range(40) if i != 3])
-    assert table.skipped == 1
 
 
 @pytest.mark.parametrize(("clock", "unit_s"), [("time_us", 1e-6), ("stamp_ns", 1e-9), ("t (ms)", 1e-3), ("ts_s", 1.0)])
@@ -106,21 +91,6 @@ def test_any_clock_may_state_its_unit(tmp_path, clock, unit_s):
     rows = [f"{round(i / 10 / unit_s)},1\n" for i in range(0, 400, 10)]
     table = read_table(write(tmp_path, f"{clock},vgx\n" + "".join(rows)))
     np.testing.assert_allclose(table.stamps_s, np.arange(40.0))
-
-
-@pytest.mark.parametrize(
-    ("header", "value", "said"),
-    [
-        ("vgx", 3, False),
-        ("vgx", 0.3, True),
-        ("vgx (m/s)", 0.3, False),
-        ("yaw", 0.05, True),
-        ("yaw_rad", 0.05, False),
-    ],
-)
-def test_implausible_numbers_are_reported_as_without_a_unit(tmp_path, header, value, said):
-    path = write(tmp_path, f"stamp_s,{header}\n" + "".join(f"{i / 10},{value}\n" for i in range(40)))
-    assert any("unit" in warning for warning in read_telemetry(path)[1]) is said
 
 
 @pytest.mark.parametrize(
@@ -156,13 +126,6 @@ def test_unit_and_axis_of_the_velocity_are_found_from_height(tmp_path, velocity_
     samples = table.samples(units)
     assert samples[0].velocity_m_s[2] == pytest.approx(0.4, abs=0.01)
     assert samples[1].stamp_s == pytest.approx(0.1)  # milliseconds, told by their spacing
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_constant_height_determines_no_unit(tmp_path):
-    rows = [f"{100 * k},0,0,{2 + k % 3},100" for k in range(100)]
-    table = read_table(write(tmp_path, "\n".join(["timestamp,vx,vy,vz,tof", *rows]) + "\n"))
-    assert "too little vertical motion" in detect_units(table).evidence
 
 
 def date_of(ms):
@@ -206,23 +169,6 @@ def test_a_flight_that_another_program_logged_is_read_the_same(tmp_path, how):
     sample = table.samples(units)[1]
     assert sample.velocity_m_s[2] == pytest.approx(0.4 * math.cos(0.08), abs=0.01)
     assert (sample.height_m if how.startswith("h in") else sample.tof_m) == pytest.approx(1.04, abs=0.011)
-
-
-def test_units_can_be_given(tmp_path):
-    path = climbing(tmp_path, 0.1, -1)
-    assert read_telemetry(path, TelemetryUnits(0.01))[0][0].velocity_m_s[2] == pytest.approx(0.04, abs=0.001)
-
-
-@pytest.mark.data
-@pytest.mark.parametrize(("name", "count", "seconds"), [("flight_a", 2498, 253), ("flight_b", 2711, 275)])
-def test_real_flights_are_read_with_their_clock_and_units(data_dir, name, count, seconds):
-    table = read_table(data_dir / "tello_telemetry" / f"{name}.csv")
-    assert (len(table.stamps_s), table.skipped) == (count, 0)
-    assert table.stamps_s[-1] - table.stamps_s[0] == pytest.approx(seconds, abs=1.0)
-    units = detect_units(table)
-    assert (units.velocity_m_s, units.z_down) == (0.1, True)
-    samples = table.samples(units)
-    assert all(0.0 < s.battery <= 1.0 for s in samples)
 
 
 cells = st.one_of(
@@ -291,17 +237,6 @@ def test_units_of_header_and_cells_are_read(tmp_path, header, cell, field, expec
 
 
 @pytest.mark.parametrize(
-    ("unit", "cell"), [("m/s", "1.5"), ("ft/s", "4.92126"), ("mph", "3.35540"), ("km/h", "5.4"), ("cm/s", "150")]
-)
-def test_units_of_velocities_and_angles_are_those_of_the_header(tmp_path, unit, cell):
-    rows = "".join(f"{0.1 * k},{cell},0,0,0.5\n" for k in range(30))
-    path = write(tmp_path, f"stamp_s,vgx ({unit}),vgy ({unit}),vgz ({unit}),yaw (rad)\n{rows}")
-    sample = read_telemetry(path)[0][3]
-    assert sample.velocity_m_s[0] == pytest.approx(1.5, rel=1e-4)
-    assert np.isnan(sample.rpy_rad[2]) or sample.rpy_rad[2] == pytest.approx(-0.5)
-
-
-@pytest.mark.parametrize(
     ("times", "seconds"),
     [
         (["4294967000", "4294967100", "4294967200", "4", "104"], 0.1),  # 2**32 ms
@@ -314,18 +249,6 @@ def test_clocks_that_begin_anew_and_dates_are_read(tmp_path, times, seconds):
     table = read_table(write(tmp_path, "timestamp,yaw\n" + "".join(f"{t},1\n" for t in times)))
     np.testing.assert_allclose(np.diff(table.stamps_s), seconds, atol=0.005)
     assert len(table.stamps_s) == len(times)
-
-
-def test_stamps_in_another_unit_than_their_name_are_reported(tmp_path):
-    rows = "".join(f"{100 * k},{k}\n" for k in range(20))
-    samples, said = read_telemetry(write(tmp_path, f"stamp_s,yaw\n{rows}"))
-    assert samples[-1].stamp_s == pytest.approx(1.9)
-    assert any("milliseconds" in warning for warning in said)
-
-
-def test_a_column_without_a_number_is_named(tmp_path):
-    said = read_telemetry(write(tmp_path, "stamp_s,yaw,tof\n0,1,n/a\n0.1,1,n/a\n"))[1]
-    assert any("'tof' holds no number" in warning for warning in said)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch import cli
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.readers.pace import ReadingsCursor
@@ -153,16 +152,6 @@ def test_pictures_are_undistorted_and_keyframes_have_features_drawn(flight):
     assert np.abs(drawn[9:16, 7:14].astype(int) - expected[9:16, 7:14]).max() > 40  # a keypoint at (10, 12)
 
 
-def test_scale_and_health_are_there(flight):
-    assert flight["/edgeslam/scale"][0].ros_msg.data == 2.0
-    assert flight["/edgeslam/scale_sigma"][0].ros_msg.data == 0.1
-    tracking, scale = flight["/diagnostics"][0].ros_msg.status
-    assert (tracking.name, tracking.message) == ("edgeslam: tracking", "tracked")
-    assert _level(tracking) == 0 and scale.message == "metres to 5 %, battery 75 %"
-    values = {value.key: value.value for value in scale.values}
-    assert values["doubt 1"] == "no depth" and "telemetry age" not in values
-
-
 def _level(status):
     return status.level if isinstance(status.level, int) else status.level[0]
 
@@ -186,14 +175,6 @@ def test_a_full_disk_ends_the_file_and_not_the_run(tmp_path, monkeypatch, caplog
     view.on_finish(slam)
     assert "No space left" in caplog.text and list(tmp_path.iterdir()) == []
     assert "No space left" in view.failure, "the command ends with an error"
-
-
-def test_what_a_run_found_is_not_offered_to_the_next(tmp_path, capsys):
-    _fly(tmp_path / "a.mcap")
-    assert cli.main(["topics", str(tmp_path / "a.mcap")]) == 0
-    out = capsys.readouterr().out
-    used = [line for line in out.splitlines() if line.endswith((" image", " camera", " odom"))]
-    assert [line.split()[0] for line in used] == ["/camera/camera_info", "/camera/image/compressed"]
 
 
 def test_readings_of_an_imu_are_saved_and_read_again(tmp_path, rng):

@@ -5,9 +5,7 @@ from edgeslam_torch.writers.raster_axes import (
     BACKGROUND,
     axes_around,
     draw_grid,
-    draw_path,
     draw_points,
-    text,
 )
 
 
@@ -46,18 +44,3 @@ def test_the_grid_has_labelled_lines_at_round_numbers():
     zero = axes.pixels(np.zeros((1, 2)))[0].round().astype(int)
     assert changed(axes.image)[zero[1]].all() and changed(axes.image)[:, zero[0]].all()
     assert changed(picture[:, :70]).sum() > 20  # labels of the ticks on the left
-
-
-def test_a_path_is_drawn_without_its_gaps():
-    image = page()
-    points = np.array([[0.0, 0.0], [np.nan, 1.0], [1.0, 1.0], [1e12, 0.0]])
-    axes = axes_around(image, points[[0, 2]])
-    draw_path(axes, points, (255, 0, 0), 1)
-    assert (image[:, :, 0] > 200).sum() > 50
-
-
-@pytest.mark.parametrize("at", [(100, 60), (0, 0), (199, 119), (-500, 60)])
-def test_text_is_cut_at_the_border(at):
-    image = page()
-    text(image, "along [m]", at, 0.5, anchor=(0.5, 0.5))
-    assert changed(image).any() == (at[0] >= 0)

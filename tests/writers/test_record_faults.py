@@ -15,7 +15,6 @@ from emulated import PATIENCE_S, emulated, on_the_floor, until
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.drone.emulator.drone import Mode
-from edgeslam_torch.drone.udp import open_udp
 from edgeslam_torch.readers.source import open_source
 
 pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
@@ -97,24 +96,3 @@ def test_a_drone_that_stops_answering(tmp_path, capsys):
     error = capsys.readouterr().err.splitlines()[-1]
     assert re.fullmatch(r"edgeslam: error: 127.0.0.1: the flight was ended: no (state|video) for 5 s", error)
     check_flight(tmp_path / "flight", tmp_path, 5)
-
-
-@pytest.mark.slow
-@pytest.mark.alone
-def test_garbage_on_every_port(tmp_path, capsys):
-    """Sent by the drone itself, and by others on its own address, where no filter tells them apart."""
-    with emulated(garbage=0.2) as (emulator, url):
-        ports = [int(port) for port in url.rsplit(":", 3)[1:]]
-
-        def shout(stop):
-            rng = np.random.default_rng(1)
-            with open_udp(("127.0.0.1", 0), "noise") as udp:
-                while not stop.wait(0.02):
-                    for port in ports:
-                        udp.sendto(rng.bytes(int(rng.integers(1, 1400))), ("127.0.0.1", port))
-
-        with meanwhile(shout):
-            assert record(url, tmp_path / "flight", "--max-frames", "60") == 0
-        assert on_the_floor(emulator)
-    assert "60 frames" in capsys.readouterr().out
-    check_flight(tmp_path / "flight", tmp_path, 60)

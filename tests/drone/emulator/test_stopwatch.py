@@ -1,5 +1,3 @@
-import time
-
 import numpy as np
 import pytest
 
@@ -30,18 +28,3 @@ def test_the_room_is_painted_where_the_drone_is(monkeypatch):
     drone.p_w = drone.p_w + [0.3, 0.0, 0.8]
     assert np.abs(paint(drone.T_w_b()).astype(float) - first).mean() > 3.0
     assert drone.clearance(drone.p_w) > 0.0
-
-
-@pytest.mark.slow
-@pytest.mark.alone
-def test_our_client_measures_the_delay_of_the_emulated_video():
-    pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
-    from edgeslam_torch.drone.emulator.measure import measure
-
-    begin = time.monotonic()
-    found = measure(2.0, ["--video-latency=200", "--render-width=160"])
-    took = time.monotonic() - begin
-    assert 0 < found.fresh <= found.pictures
-    assert found.states > 0
-    assert 0.2 <= np.median(found.delay_s) < took
-    assert "pictures/s" in found.lines(200.0)[0]

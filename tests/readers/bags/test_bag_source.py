@@ -7,9 +7,7 @@ import bag_files as bags
 import cv2
 import numpy as np
 import pytest
-from ros1_bag import ros1_bag
 
-from edgeslam_torch import cli
 from edgeslam_torch.errors import CalibrationError, SourceError
 from edgeslam_torch.readers.source import open_source
 
@@ -64,15 +62,6 @@ def test_each_format_gives_the_pictures_stamps_and_calibration_that_were_written
     assert camera.distortion == (0.05, -0.02, 0.001, -0.002, 0.01)
     assert source.kind == "bag" and source.length == 5 and source.warnings == []
     assert len(list(source.frames())) == 5  # a second time
-
-
-def test_a_bag_written_byte_by_byte_after_the_format(tmp_path):
-    times = _times(4)
-    path = tmp_path / "a.bag"
-    path.write_bytes(ros1_bag("/cam/image_raw", times, [_pixels(i).tobytes() for i in range(4)], 64, 48))
-    frames = list(open_source(path).frames())
-    assert [frame.stamp_s for frame in frames] == pytest.approx(times, abs=1e-6)
-    np.testing.assert_array_equal(frames[2].image, _pixels(2)[:, :, ::-1])  # written as RGB
 
 
 def test_missing_and_empty_camera_info_are_said(tmp_path):
@@ -166,14 +155,6 @@ def test_wrong_topics_are_refused(tmp_path, topic):
         open_source(path, topics=[topic])
 
 
-def test_topics_of_what_is_no_bag_and_bags_without_pictures_are_refused(tmp_path):
-    with pytest.raises(SourceError, match="--topic"):
-        open_source(_any_camera(tmp_path), topics=["/x"])
-    nothing = bags.write_mcap(tmp_path / "b.mcap", [("/chat", "std_msgs/msg/String", 1.0, {"data": "hi"})])
-    with pytest.raises(SourceError, match="no pictures"):
-        open_source(nothing)
-
-
 def test_several_odometries_are_not_guessed_between(tmp_path):
     times = _times(40)
     two = [
@@ -187,20 +168,6 @@ def test_several_odometries_are_not_guessed_between(tmp_path):
     chosen = open_source(path, topics=["odom=/wheels"])
     assert chosen.telemetry[5].velocity_m_s == pytest.approx([1.0, 0.0, 0.0])
     assert open_source(path, topics=["odom=none"]).telemetry == []
-
-
-def test_topics_are_listed_with_what_they_are_used_as(tmp_path, capsys):
-    data = np.full((48, 64), 900, np.uint16)
-    depth = [("/depth/image", IMAGE, t, bags.picture(t, data, "16UC1")) for t in _times(2)]
-    odom = [("/odom", ODOM, t, bags.odometry(t, (0, 0, 0), 0.0, (1, 0, 0))) for t in _times(31)]
-    path = bags.write_mcap(tmp_path / "a.mcap", _in_order(_pictures(_times(31), late_s=0.0), depth, odom))
-    assert cli.main(["topics", str(path)]) == 0
-    lines = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines()[2:]}
-    assert lines["/cam/image_raw"][1:] == ["sensor_msgs/Image", "31", "30.0", "image"]
-    assert lines["/odom"][-1] == "odom"
-    assert "".join(lines["/depth/image"][4:]) == "notused(depthmap,16UC1)"
-    assert cli.main(["topics", str(tmp_path / "no.bag")]) == 1
-    assert "no such file" in capsys.readouterr().err
 
 
 def test_a_folder_without_metadata_is_read_if_it_has_one_file(tmp_path):

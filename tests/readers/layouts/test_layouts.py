@@ -100,14 +100,6 @@ def test_stamps_of_a_layout_may_be_in_any_unit(tmp_path, write_images, kind, fac
     assert np.allclose(stamps, [1305031102.2 + i / 30 for i in range(12)], atol=2e-3)
 
 
-@pytest.mark.parametrize("begin", [0, 328551511918592, 1403636579763555584])
-@pytest.mark.parametrize("prefix", ["", "frame_", "cam0-"])
-def test_names_may_be_nanoseconds(tmp_path, write_images, begin, prefix):
-    write_images(tmp_path, [f"{prefix}{begin + i * 33333333}.png" for i in range(12)])
-    source = open_source(tmp_path)
-    assert np.allclose(np.diff([frame.stamp_s for frame in source.frames()]), 1 / 30, rtol=1e-3)
-
-
 @pytest.mark.parametrize("rows", [["0.1"], ["a 0.1", "b 0.2"]])
 def test_times_that_do_not_fit_the_images_are_refused(tmp_path, write_images, rows):
     write_images(tmp_path / "images", [f"{i}.png" for i in range(4)])
