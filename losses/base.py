@@ -2,8 +2,9 @@
 
 Inputs without a batch axis give a scalar ``()``, batches ``(B, ...)`` one value an item ``(B,)``. What was not observed
 (outside a mask, NaN or infinity in an observation) is left out, with a gradient of zero whatever stands there. What is
-not finite in a prediction that counts gives NaN (the terms of `depth_terms` may give infinity): a network that has
-diverged is seen. A finite loss has finite gradients. Half inputs are computed, and returned, in float32.
+not finite in a prediction that counts, or larger than 4e9 in float32 (`in_full_precision`), gives NaN (the terms of
+`depth_terms` may give infinity): a network that has diverged is seen. A finite loss has finite gradients. Half inputs
+are computed, and returned, in float32.
 """
 
 from enum import StrEnum
@@ -13,6 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from edgeslam_torch.losses.robust import Kernel, rho
+
+MIN_FOCAL_PX = 1e-6
+"""Focal lengths below it calibrate nothing."""
 
 
 class Residuals(NamedTuple):
@@ -103,8 +107,13 @@ def masked(value: Tensor, valid: Tensor, lost: Tensor | None = None) -> Residual
 
 
 def lost_of(seen: Tensor, K: Tensor, *predicted: Tensor) -> Tensor:
-    """Which observed elements ``(..., N)`` have a prediction ``(..., N, D)`` or calibration that is not finite."""
-    return seen & ~(torch.cat(predicted, -1).isfinite().all(-1) & K.isfinite().all((-1, -2))[..., None])
+    """Which observed elements ``(..., N)`` have a prediction ``(..., N, D)`` that is not finite, or no calibration."""
+    return seen & ~(torch.cat(predicted, -1).isfinite().all(-1) & calibrates(K)[..., None])
+
+
+def calibrates(K: Tensor) -> Tensor:
+    """Which matrices ``(..., 3, 3)`` are finite with focal lengths that can be divided by ``(...)``."""
+    return K.isfinite().all((-1, -2)) & (K.diagonal(dim1=-2, dim2=-1)[..., :2].abs() > MIN_FOCAL_PX).all(-1)
 
 
 def back_project(uv: Tensor, depth_m: Tensor, K: Tensor) -> Tensor:
@@ -144,6 +153,7 @@ def move(T: Tensor, p: Tensor) -> Tensor:
 
 
 def _intrinsics(K: Tensor) -> tuple[Tensor, Tensor]:
-    """Focal lengths and principal point, ``(2,)`` or ``(..., 1, 2)`` each."""
+    """Focal lengths and principal point, ``(2,)`` or ``(..., 1, 2)`` each; NaN without a calibration."""
+    K = K.where(calibrates(K)[..., None, None], torch.nan)
     focal, centre = K.diagonal(dim1=-2, dim2=-1)[..., :2], K[..., :2, 2]
     return (focal, centre) if K.ndim == 2 else (focal[..., None, :], centre[..., None, :])

@@ -15,7 +15,8 @@ def in_full_precision(function: Callable[P, R]) -> Callable[P, R]:
     """Widen floating-point tensors among the arguments to one dtype, float32 at least, and leave autocast.
 
     Sums over an image pass float16's largest number (65 504), and its 11 bits place a pixel of a 640 wide image to
-    half a pixel only. Gradients arrive in the inputs' own dtypes.
+    half a pixel only. Gradients arrive in the inputs' own dtypes. Numbers whose fourth power the dtype cannot hold
+    (float32: 4e9) become NaN: products of squares would be infinite, and their gradients NaN beside a finite loss.
     """
 
     def widened(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -34,7 +35,10 @@ def in_full_precision(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _widened(x: object, dtype: torch.dtype) -> object:
-    return x.to(dtype) if isinstance(x, Tensor) and x.is_floating_point() else x
+    if not (isinstance(x, Tensor) and x.is_floating_point()):
+        return x
+    x = x.to(dtype)
+    return x.where(x.abs() < torch.finfo(dtype).max ** 0.25, torch.nan)
 
 
 def check_mask(mask: Tensor) -> None:

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from edgeslam_torch.losses.base import back_project, move, project
+from edgeslam_torch.losses.base import back_project, calibrates, move, project
 from edgeslam_torch.losses.depth_terms import masked_mean
 from edgeslam_torch.losses.inputs import check_shapes, in_full_precision
 from edgeslam_torch.losses.sampling import finite_part, sample
@@ -113,7 +113,7 @@ class PhotometricLoss(nn.Module):
         image_i, seen_i = finite_part(image_i)
         costs, still = [], []
         lost = ~((depth_i <= 0) | depth_i.isfinite()).flatten(1).all(1)
-        lost = lost | ~torch.cat((T_j_i.flatten(1), K.flatten(1)), 1).isfinite().all(1)
+        lost = lost | ~(T_j_i.isfinite().flatten(1).all(1) & calibrates(K))
         for s in range(images_j.shape[1]):
             warped, valid, whole = _warped(images_j[:, s], depth_i, T_j_i[:, s], K)
             image_j, seen_j = finite_part(images_j[:, s])
