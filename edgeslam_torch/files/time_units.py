@@ -50,7 +50,8 @@ def seconds_of(stamps: ArrayLike, gaps_s: tuple[float, float] = PLAUSIBLE_GAPS_S
         return array * SECONDS_PER_UNIT[unit], unit
     gap = float(np.median(gaps))
     smaller = sorted(("ms", "us", "ns"), key=lambda unit: abs(np.log(gap * SECONDS_PER_UNIT[unit] / _USUAL_GAP_S)))
-    for unit in (*dated, "s", *smaller):
+    possible = (unit for unit in (*dated, "s", *smaller) if size * SECONDS_PER_UNIT[unit] <= MAX_STAMP_S)
+    for unit in possible:
         if gaps_s[0] * 0.999 <= gap * SECONDS_PER_UNIT[unit] <= gaps_s[1] * 1.001:  # differences of float64
             return array * SECONDS_PER_UNIT[unit], unit
     return array, UNKNOWN

@@ -125,8 +125,10 @@ def in_order(entries: Sequence[ImageEntry], name: str) -> tuple[list[ImageEntry]
         name: File or folder that lists them, for messages.
 
     Raises:
-        SourceError: If most images have the stamp of another one.
+        SourceError: If no stamp is a time, or most images have the stamp of another one.
     """
+    if entries and not any(abs(entry.stamp_s) <= MAX_STAMP_S for entry in entries):
+        raise SourceError(f"{name}: none of its stamps is a time, such as {entries[0].stamp_s:g} s")
     problems = [
         Problem(str(entry.path), f"stamp {entry.stamp_s:g} is not a time; image left out")
         for entry in entries

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.listing import ImageEntry, Problem, entries_in_time, in_order, read_list
+from edgeslam_torch.readers.source import open_source
 
 
 def entries(stamps):
@@ -74,6 +75,17 @@ def test_what_is_no_time_costs_its_image(stamp):
     kept, problems = entries_in_time([0.0, 0.1, stamp, 0.3, stamp], [Path(f"{i}.png") for i in range(5)], "rgb.txt")
     assert [entry.index for entry in kept] == [0, 1, 3]
     assert len(problems) == 2
+
+
+@pytest.mark.parametrize("layout", ["rgb.txt", "mav0/cam0/data.csv"])
+def test_stamps_that_are_no_times_are_named_as_the_cause(tmp_path, write_images, layout):
+    """Windows counts tenths of a microsecond since 1601."""
+    names = [f"{i}.png" for i in range(12)]
+    place = tmp_path / layout
+    write_images(place.parent / ("data" if "mav0" in layout else ""), names)
+    place.write_text("".join(f"{129495623021753040 + 333333 * i},{name}\n" for i, name in enumerate(names)))
+    with pytest.raises(SourceError, match=r"none of its stamps is a time, such as 1.29\d*e\+17"):
+        open_source(tmp_path)
 
 
 @pytest.mark.parametrize("line", ["{} {}", "{}\t{}", "{},{}", "{};{}", '"{}";"{}"', "{}, {}"])

@@ -45,10 +45,11 @@ def _timed(folder: Path, times: Path) -> tuple[list[ImageEntry], list[Problem]]:
     several = bool(table.rows) and len(table.rows[0].cells) > 1
     stamps = table.numbers([1 if several else 0])[:, 0]
     by_name = {row.cells[0]: stamp for row, stamp in zip(table.rows, stamps.tolist(), strict=False)}
-    named = [path for path in files if path.stem in by_name] if several else []
+    given = {path: by_name.get(path.stem, by_name.get(path.name)) for path in files} if several else {}
+    named = {path: stamp for path, stamp in given.items() if stamp is not None}
     if named:
-        left_out = [Problem(str(path), f"is not in {times.name}") for path in files if path.stem not in by_name]
-        kept, problems = entries_in_time([by_name[path.stem] for path in named], named, str(times))
+        left_out = [Problem(str(path), f"is not in {times.name}") for path in files if path not in named]
+        kept, problems = entries_in_time([*named.values()], [*named], str(times))
         return kept, left_out + problems
     if len(stamps) != len(files):
         raise SourceError(f"{times}: {len(stamps)} lines for {len(files)} images; a line is 'name stamp'")

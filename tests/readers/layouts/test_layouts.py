@@ -80,13 +80,14 @@ def stamped(i, factor, begin_s=1305031102.2):
 
 
 @pytest.mark.parametrize("factor", [1, 1e3, 1e6, 1e9])
-@pytest.mark.parametrize("kind", ["tum", "euroc", "kitti", "mono_vo"])
+@pytest.mark.parametrize("kind", ["tum", "euroc", "kitti", "mono_vo", "mono_vo, suffixes"])
 def test_stamps_of_a_layout_may_be_in_any_unit(tmp_path, write_images, kind, factor):
     lists = {
         "tum": ("rgb.txt", "rgb", "{0} rgb/{1}"),
         "euroc": ("mav0/cam0/data.csv", "mav0/cam0/data", "{0},{1}"),
         "kitti": ("times.txt", "image_0", "{0}"),
         "mono_vo": ("times.txt", "images", "{2} {0} 12.5"),
+        "mono_vo, suffixes": ("times.txt", "images", "{1} {0}"),
     }
     listing, images, line = lists[kind]
     names = [f"{i:05d}.png" for i in range(12)]
@@ -96,7 +97,7 @@ def test_stamps_of_a_layout_may_be_in_any_unit(tmp_path, write_images, kind, fac
     cv2.imwrite(str(tmp_path / "vignette.png"), np.full((48, 64), 65535, np.uint16))
     source = open_source(tmp_path)
     stamps = [frame.stamp_s for frame in source.frames()]
-    assert source.kind == kind
+    assert source.kind == kind.split(",")[0]
     assert np.allclose(stamps, [1305031102.2 + i / 30 for i in range(12)], atol=2e-3)
 
 
