@@ -40,8 +40,9 @@ def main(args: argparse.Namespace) -> int:
 
     run = open_run(args.run)
     if args.out is not None:
+        recording = [run.source] if run.source is not None else []
         for path in _files(args.out, args.format):
-            check_not_read(path, [args.run] if path.suffix != ".png" else [], "--out")
+            check_not_read(path, recording if path.suffix == ".png" else [args.run], "--out")
             check_new(path, args.overwrite)
     cloud = _chosen(run, args)
     try:
@@ -57,13 +58,14 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _files(out: Path, kind: str) -> list[Path]:
-    """What will be written, the folders of nerfstudio's pictures by their first."""
+    """What will be written, the folders of nerfstudio's pictures by one that is there, else their first."""
     if kind == "occupancy":
         return [out.with_suffix(suffix) for suffix in (".pgm", ".yaml")]
     if kind == "colmap":
         return [out / name for name in ("cameras.txt", "images.txt", "points3D.txt")]
     if kind == "nerfstudio":
-        pictures = [out / folder / "00000.png" for folder in ("images", "masks", "depth")]
+        folders = (out / name for name in ("images", "masks", "depth"))
+        pictures = [next(folder.glob("*.png"), folder / "00000.png") for folder in folders]
         return [out / "transforms.json", out / "edge_map.ply", *pictures]
     return [out]
 

@@ -7,11 +7,12 @@ whatever name or hard link it is given. Folders of runs have a rule of their own
 import argparse
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.record_files import read_mapping, recording_of
 
 _PARTS = re.compile(
     r"trajectory.*\.txt|status\.csv|summary\.json|(edge_map|anchors)\.ply|observations\.npz"
@@ -66,18 +67,19 @@ def check_outputs(parser: argparse.ArgumentParser, args: argparse.Namespace) -> 
         check_new(path, args.overwrite, option)
 
 
-def check_not_read(path: Path, read: Iterable[str | Path], option: str, made: bool = False) -> None:
+def check_not_read(path: Path, read: Sequence[str | Path], option: str, made: bool = False) -> None:
     """Check that a file to write is none of those read, and no part of a run or recording among them.
 
     Args:
         path: The file.
-        read: Files and folders that the command reads.
+        read: Files and folders that the command reads; with a run, the recording that it is of.
         option: Where the file comes from.
         made: Whether a file of this name is what the command makes and not what it reads.
 
     Raises:
         OutputError: If it is.
     """
+    read = [*read, *(recording for run in read if (recording := _recording_of(Path(run))) is not None)]
     places = [path]
     if path.exists() and not made:
         if _PICTURE.fullmatch(path.name):
@@ -120,6 +122,13 @@ def _paths(value: Any) -> Iterator[str | Path]:
     elif isinstance(value, list | tuple):
         for item in value:
             yield from _paths(item)
+
+
+def _recording_of(run: Path) -> Path | None:
+    try:
+        return recording_of(run, read_mapping(run / "summary.json", "JSON", OutputError))
+    except (OutputError, ValueError):  # no run, or no name of one
+        return None
 
 
 def _same(path: Path, other: str | Path) -> bool:

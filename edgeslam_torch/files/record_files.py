@@ -3,7 +3,7 @@
 import json
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -86,3 +86,10 @@ def read_mapping(path: Path, kind: str, error: type[EdgeSlamError]) -> dict[str,
     if not isinstance(record, dict):
         raise error(f"{path}: not a {kind} object")
     return record
+
+
+def recording_of(run: Path, summary: Mapping[str, Any]) -> Path | None:
+    """What a run read, by its summary, which names it relative to the run's folder; None if it does not say."""
+    source = summary.get("source")
+    name = source.get("path") if isinstance(source, dict) else source
+    return run / name if isinstance(name, str) and name else None

@@ -10,7 +10,7 @@ import numpy as np
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import nearest
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
-from edgeslam_torch.files.record_files import read_mapping
+from edgeslam_torch.files.record_files import read_mapping, recording_of
 from edgeslam_torch.types import PointCloud
 from edgeslam_torch.writers.ply import read_ply
 from edgeslam_torch.writers.run_summary import vertical_text
@@ -70,13 +70,9 @@ class RunFolder:
     @property
     def source(self) -> Path | None:
         """Input folder of the run, if named in its summary and still present; relative to the run's folder."""
-        source = self.summary.get("source")
-        name = source.get("path") if isinstance(source, dict) else source
-        if not isinstance(name, str) or not name:
-            return None
-        folder = self.path / name
+        folder = recording_of(self.path, self.summary)
         try:
-            return folder if folder.is_dir() else None
+            return folder if folder is not None and folder.is_dir() else None
         except (OSError, ValueError):  # an impossible folder name
             return None
 

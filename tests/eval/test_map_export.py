@@ -14,7 +14,7 @@ import yaml
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.commands import export_map
-from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.errors import EdgeSlamError, OutputError
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.types import PointCloud
@@ -189,6 +189,18 @@ def test_nerfstudio_without_images_says_so(run_folder, tmp_path):
     save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
     with pytest.raises(EdgeSlamError, match=r"images of the keyframes are not there; .*--keep-images"):
         export(tmp_path / "a", "--format", "nerfstudio")
+
+
+@pytest.mark.parametrize("options", [[], ["--overwrite"]])
+def test_nerfstudio_replaces_no_picture_of_the_recording(options, run_folder, tmp_path):
+    run_folder(tmp_path / "a")
+    summary = json.loads((tmp_path / "a" / "summary.json").read_text())
+    (tmp_path / "a" / "summary.json").write_text(json.dumps(summary | {"source": {"path": "../flight"}}))
+    picture = tmp_path / "flight" / "images" / "00001.png"
+    picture.parent.mkdir(parents=True)
+    picture.touch()
+    with pytest.raises(OutputError, match="give another file to --out"):
+        export(tmp_path / "a", "--format", "nerfstudio", "--out", tmp_path / "flight", *options)
 
 
 def test_occupancy_needs_metres(run_folder, tmp_path):

@@ -71,6 +71,17 @@ def test_what_is_read_is_never_replaced(parser, tmp_path, monkeypatch, spelling)
         _check(parser, "first", path, "--json", other, "--overwrite")
 
 
+@pytest.mark.parametrize("name", ["groundtruth.txt", "rgb/1.png"])
+def test_the_recording_of_a_run_is_read_with_it(parser, tmp_path, name):
+    run, path = tmp_path / "runs" / "a", tmp_path / "flight" / name
+    for folder in (run, path.parent):
+        folder.mkdir(parents=True)
+    (run / "summary.json").write_text('{"source": {"path": "../../flight"}}')
+    path.touch()
+    with pytest.raises(OutputError, match="reads"):
+        _check(parser, run, "--json", path, "--overwrite")
+
+
 def test_two_results_need_two_files(parser, tmp_path):
     with pytest.raises(OutputError, match="twice"):
         _check(parser, "in", "--json", tmp_path / "a", "-m", tmp_path / "." / "a")
