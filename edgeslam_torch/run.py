@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -256,25 +256,38 @@ class _Run:
         self.tally = Tally()
         self.dropped = Counter()
         self.interrupt = _Interrupt()
-        self.stopped_by: str | None = None
-        """Reason why the loop ended early, as text."""
+        self.error: BaseException | None = None
+        """The first one, raised when the results are written."""
         self.result: RunResult | None = None
         self.last_index: int | None = None
 
     def go(self) -> RunResult:
         wall, cpu = time.perf_counter(), time.process_time()
         with self.interrupt:
-            try:
+            with self._error_kept():
                 self._loop()
-            except BaseException as error:
-                self.stopped_by = " ".join(str(error).split()) or type(error).__name__
-                raise
-            finally:  # also if the source fails: write the results so far
-                if self.tally.frames:
-                    self._write(time.perf_counter() - wall, cpu)
+            if self.tally.frames:
+                self._write(time.perf_counter() - wall, cpu)
+        if self.error is not None:
+            raise self.error
         if self.result is None:
             raise SourceError(self._no_frame())
         return self.result
+
+    @contextmanager
+    def _error_kept(self) -> Iterator[None]:
+        """What fails here does not cost the results so far."""
+        try:
+            yield
+        except BaseException as error:
+            self.error = self.error or error
+
+    def _ended_early(self) -> str | None:
+        if self.interrupt.requested:
+            return "interrupted"
+        if self.error is not None:
+            return " ".join(str(self.error).split()) or type(self.error).__name__
+        return self.writer.failure
 
     def _loop(self) -> None:
         frames = self.source.frames()
@@ -343,21 +356,24 @@ class _Run:
 
     def _write(self, loop_s: float, cpu_start_s: float) -> None:
         started = time.perf_counter()
-        for listener in self.listeners:
-            if hasattr(listener, "on_last_frame"):
-                listener.on_last_frame(self.slam)
-        try:
-            self.slam.finish()
-        except KeyboardInterrupt:
-            logger.warning("stopped before the last refinement finished")
+        with self._error_kept():
+            for listener in self.listeners:
+                if hasattr(listener, "on_last_frame"):
+                    listener.on_last_frame(self.slam)
+        with self._error_kept():
+            try:
+                self.slam.finish()
+            except KeyboardInterrupt:
+                logger.warning("stopped before the last refinement finished")
         self.interrupt.writing = True
         finish_s = time.perf_counter() - started
         self.slam.close()  # results are consistent afterwards, even if the refinement was interrupted
         stamps, poses = self.slam.trajectory()
         edge_map, anchors, scale = self.slam.edge_map(), self.slam.anchors(), self.slam.scale
         up = getattr(self.slam, "up", None)
-        for listener in self.listeners:
-            listener.on_finish(self.slam)
+        with self._error_kept():
+            for listener in self.listeners:
+                listener.on_finish(self.slam)
         saved = None if self.atlas.save is None else self.slam.saved_atlas(self.source.name)
         cpu_s = time.process_time() - cpu_start_s
         summary = {
@@ -381,7 +397,7 @@ class _Run:
             "mode": str(self.mode),
             "seed": self.config.seed,
             "interrupted": self.interrupt.requested,
-            "ended_early": "interrupted" if self.interrupt.requested else self.stopped_by or self.writer.failure,
+            "ended_early": self._ended_early(),
         }
         summary = without_folders(summary, self.writer.folder)
         support = self.slam.support()

@@ -63,18 +63,26 @@ def test_folder_holds_everything(tmp_path, write_tum):
 @pytest.mark.parametrize(
     "error", [SourceError("the camera is gone"), RuntimeError("the camera is gone"), MemoryError()]
 )
-@pytest.mark.parametrize("where", ["source", "step", "listener"])
+@pytest.mark.parametrize("where", ["source", "step", "listener", "finish", "on_last_frame", "on_finish"])
 def test_what_ends_a_run_early_is_in_the_summary_and_raised(tmp_path, write_tum, error, where):
     def fail(frame, *_):
         if frame.index == 4:
             raise error
         return step(frame, *_) if where == "step" else frame
 
+    def fail_at_the_end(*_):
+        raise error
+
     slam = FakeSlam()
     step = slam.step
     if where == "step":
         slam.step = fail
+    if where == "finish":
+        slam.finish = fail_at_the_end
     listeners = [SimpleNamespace(on_frame=fail, on_finish=lambda _: None)] if where == "listener" else []
+    if where.startswith("on_"):
+        calls = {"on_frame": lambda *_: None, "on_finish": lambda _: None, where: fail_at_the_end}
+        listeners = [SimpleNamespace(**calls)]
     source = open_source(write_tum(tmp_path / "seq", 12))
     if where == "source":
         recorded = source.frames
@@ -83,7 +91,7 @@ def test_what_ends_a_run_early_is_in_the_summary_and_raised(tmp_path, write_tum,
         run(source, tmp_path / "out", make_slam=fake(slam), listeners=listeners)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["ended_early"] == (str(error) or "MemoryError")
-    assert summary["frames"] == (5 if where == "listener" else 4)
+    assert summary["frames"] == {"source": 4, "step": 4, "listener": 5}.get(where, 12)
     assert len(np.loadtxt(tmp_path / "out" / "trajectory.txt")) == summary["frames"]
     assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
 
