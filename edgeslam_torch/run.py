@@ -275,12 +275,16 @@ class _Run:
         return self.result
 
     @contextmanager
-    def _error_kept(self) -> Iterator[None]:
-        """What fails here does not cost the results so far."""
+    def _error_kept(self, stopped: str = "") -> Iterator[None]:
+        """What fails here does not cost the results so far; ``stopped`` is logged after a Ctrl-C."""
         try:
             yield
-        except BaseException as error:
-            self.error = self.error or error
+        except BaseException as error:  # libraries turn a Ctrl-C into others
+            if not self.interrupt.raised:
+                self.error = self.error or error
+            elif stopped:
+                logger.warning(stopped)
+            self.interrupt.raised = False
 
     def _ended_early(self) -> str | None:
         if self.interrupt.requested:
@@ -343,14 +347,13 @@ class _Run:
         self.last_index = frame.index
 
     def _next(self, frames: Iterator[tuple[Frame, Any]]) -> tuple[Frame, Any] | None:
-        """The next frame with its features; None at the end or on a stop request, even while the source blocks."""
+        """The next frame with its features; None at the end or on a stop request, which interrupts a source that
+        blocks."""
         if self.interrupt.requested:
             return None
         self.interrupt.at_once = True
         try:
             return next(frames, None)
-        except KeyboardInterrupt:
-            return None
         finally:
             self.interrupt.at_once = False
 
@@ -360,11 +363,8 @@ class _Run:
             for listener in self.listeners:
                 if hasattr(listener, "on_last_frame"):
                     listener.on_last_frame(self.slam)
-        with self._error_kept():
-            try:
-                self.slam.finish()
-            except KeyboardInterrupt:
-                logger.warning("stopped before the last refinement finished")
+        with self._error_kept("stopped before the last refinement finished"):
+            self.slam.finish()
         self.interrupt.writing = True
         finish_s = time.perf_counter() - started
         self.slam.close()  # results are consistent afterwards, even if the refinement was interrupted
@@ -448,6 +448,8 @@ class _Interrupt:
         self.at_once = False
         """Whether the main thread may be interrupted at once because it only waits."""
         self.writing = False
+        self.raised = False
+        """Whether the main thread was interrupted, and what that raised is not yet caught."""
         self._old: dict[int, Any] = {}
 
     def __enter__(self) -> "_Interrupt":
@@ -466,6 +468,7 @@ class _Interrupt:
         again = self.requested and number == signal.SIGINT  # a closing terminal may send its signal twice
         self.requested = True
         if self.at_once or (again and not self.writing):
+            self.raised = True
             raise KeyboardInterrupt
 
 

@@ -180,6 +180,23 @@ def test_a_run_that_comes_to_nothing_leaves_the_older_run(tmp_path, write_tum, e
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
 
 
+@pytest.mark.parametrize("converted", [False, True])
+def test_second_ctrl_c_skips_the_refinement_and_still_writes(tmp_path, write_tum, converted):
+    """Compiled loops turn the interruption into another error."""
+
+    class Slow(FakeSlam):
+        def finish(self):
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), signal.SIGINT)
+            except KeyboardInterrupt as interruption:
+                raise SystemError("result with an exception set") if converted else interruption from interruption
+
+    result = run(open_source(write_tum(tmp_path / "seq", 5)), tmp_path / "out", make_slam=fake(Slow()))
+    assert {p.name for p in result.folder.iterdir()} == FILES
+    assert result.summary["ended_early"] == "interrupted"
+
+
 def test_ctrl_c_while_a_live_source_is_silent(tmp_path, write_tum):
     source = open_source(write_tum(tmp_path / "seq", 3))
     recorded = source.frames
