@@ -90,11 +90,11 @@ def bound_memory(path: Path) -> None:
         import resource
     except ImportError:  # Windows
         return
-    bound = MEMORY_BYTES + PER_BYTE * path.stat().st_size
     try:
+        bound = MEMORY_BYTES + PER_BYTE * path.stat().st_size
         resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    except (OSError, ValueError):  # a lower limit is set, or the system supports none
+    except (OSError, ValueError):  # no file, a lower limit is set, or the system supports none
         return
 
 
