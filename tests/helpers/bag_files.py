@@ -72,6 +72,25 @@ def picture(t, pixels, encoding, pad=0, big=False):
     }
 
 
+def pixels(index, shape=(48, 64, 3)):
+    """The ``index``-th picture of a bag: noise."""
+    return np.random.default_rng(index).integers(0, 256, shape, dtype=np.uint8)
+
+
+def pictures(stamps, topic="/cam/image_raw", late_s=0.01, received=None, first=0):
+    """Events of pictures with header stamps; received ``late_s`` later, or at the times given."""
+    received = [t + late_s for t in stamps] if received is None else received
+    return [
+        (topic, "sensor_msgs/msg/Image", at, picture(t, pixels(first + i), "bgr8"))
+        for i, (t, at) in enumerate(zip(stamps, received, strict=True))
+    ]
+
+
+def in_order(*series):
+    """Events of several topics by time of receipt."""
+    return sorted((event for events in series for event in events), key=lambda event: event[2])
+
+
 def compressed(t, data, form):
     return {"header": header(t, "camera"), "format": form, "data": data}
 

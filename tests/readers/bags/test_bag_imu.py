@@ -23,7 +23,7 @@ def series(topic, rate=(0.1, 0.2, 0.3), force=(0.0, 1.0, 9.7), times=TIMES):
 
 def opened(tmp_path, *parts, topics=()):
     pictures = [("/cam0/image", IMAGE, t, bags.picture(t, np.zeros((8, 8), np.uint8), "mono8")) for t in TIMES[::40]]
-    events = sorted((e for part in (pictures, *parts) for e in part), key=lambda e: e[2])
+    events = bags.in_order(pictures, *parts)
     return open_bag(bags.write_mcap(tmp_path / "a.mcap", events), topics)
 
 

@@ -19,20 +19,15 @@ IMAGE = "sensor_msgs/msg/Image"
 BEGIN_S = 1.7e9
 
 
-def _pixels(index):
-    return np.random.default_rng(index).integers(0, 256, (48, 64, 3), dtype=np.uint8)
-
-
-def _pictures(first, count, topic="/cam/image_raw"):
-    times = [BEGIN_S + i / 30.0 for i in range(first, first + count)]
-    return [(topic, IMAGE, t, bags.picture(t, _pixels(first + i), "bgr8")) for i, t in enumerate(times)]
+def _pictures(first, count):
+    return bags.pictures([BEGIN_S + i / 30.0 for i in range(first, first + count)], late_s=0.0, first=first)
 
 
 def _check_read(path, count):
     frames = list(open_source(path).frames())
     assert [round((frame.stamp_s - BEGIN_S) * 30) for frame in frames] == list(range(count))
     for i, frame in enumerate(frames):
-        np.testing.assert_array_equal(frame.image, _pixels(i))
+        np.testing.assert_array_equal(frame.image, bags.pixels(i))
 
 
 @pytest.mark.parametrize("name", ["a#b.db3", "a%41?.db3", "a b.db3", "a.bag", "a#?.mcap"])

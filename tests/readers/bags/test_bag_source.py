@@ -18,25 +18,8 @@ BEGIN_S = 1.7e9
 WRITERS = {"a.mcap": bags.write_mcap, "a.bag": bags.write_ros1, "a": bags.write_ros2}
 
 
-def _pixels(index, shape=(48, 64, 3)):
-    return np.random.default_rng(index).integers(0, 256, shape, dtype=np.uint8)
-
-
-def _pictures(stamps, topic="/cam/image_raw", late_s=0.01, received=None):
-    """Pictures with header stamps; received ``late_s`` later, or at the times given."""
-    received = [t + late_s for t in stamps] if received is None else received
-    return [
-        (topic, IMAGE, at, bags.picture(t, _pixels(i), "bgr8"))
-        for i, (t, at) in enumerate(zip(stamps, received, strict=True))
-    ]
-
-
 def _times(count, hz=30.0):
     return [BEGIN_S + i / hz for i in range(count)]
-
-
-def _in_order(*series):
-    return sorted((event for events in series for event in events), key=lambda event: event[2])
 
 
 def _stamps(source):
@@ -51,12 +34,12 @@ def _reasons(source):
 def test_each_format_gives_the_pictures_stamps_and_calibration_that_were_written(tmp_path, name):
     times = _times(5)
     info = ("/cam/camera_info", INFO, BEGIN_S, bags.camera_info((64, 48), 60.0, (0.05, -0.02, 0.001, -0.002, 0.01)))
-    path = WRITERS[name](tmp_path / name, [info, *_pictures(times)])
+    path = WRITERS[name](tmp_path / name, [info, *bags.pictures(times)])
     source = open_source(path)
     frames = list(source.frames())
     assert [frame.stamp_s for frame in frames] == pytest.approx(times, abs=1e-6)
     for i, frame in enumerate(frames):
-        np.testing.assert_array_equal(frame.image, _pixels(i))
+        np.testing.assert_array_equal(frame.image, bags.pixels(i))
     camera = source.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (60.0, 60.0, 31.5, 23.5)
     assert camera.distortion == (0.05, -0.02, 0.001, -0.002, 0.01)
@@ -65,17 +48,17 @@ def test_each_format_gives_the_pictures_stamps_and_calibration_that_were_written
 
 
 def test_missing_and_empty_camera_info_are_said(tmp_path):
-    without = open_source(bags.write_mcap(tmp_path / "a.mcap", _pictures(_times(2))))
+    without = open_source(bags.write_mcap(tmp_path / "a.mcap", bags.pictures(_times(2))))
     assert "no calibration found" in without.warnings[0]
     info = ("/cam/camera_info", INFO, BEGIN_S, bags.camera_info((64, 48), 0.0))
-    empty = open_source(bags.write_mcap(tmp_path / "b.mcap", [info, *_pictures(_times(2))]))
+    empty = open_source(bags.write_mcap(tmp_path / "b.mcap", [info, *bags.pictures(_times(2))]))
     assert "no calibration found" in empty.warnings[0] and "empty calibration" in _reasons(empty)
 
 
 def test_two_cameras_are_named_and_one_is_asked_for(tmp_path):
-    left, right = _pictures(_times(3), "/cam0/image_raw"), _pictures(_times(2), "/cam1/image_raw")
+    left, right = bags.pictures(_times(3), "/cam0/image_raw"), bags.pictures(_times(2), "/cam1/image_raw")
     infos = [(f"/cam{i}/camera_info", INFO, BEGIN_S, bags.camera_info((64, 48), f)) for i, f in enumerate((60.0, 70.0))]
-    path = bags.write_mcap(tmp_path / "a.mcap", _in_order(infos, left, right))
+    path = bags.write_mcap(tmp_path / "a.mcap", bags.in_order(infos, left, right))
     with pytest.raises(SourceError, match=r"two cameras \(/cam0/image_raw, /cam1/image_raw\).*--topic /cam0/image_raw"):
         open_source(path)
     source = open_source(path, topics=["/cam1/image_raw"])
@@ -83,16 +66,16 @@ def test_two_cameras_are_named_and_one_is_asked_for(tmp_path):
 
 
 def test_raw_and_compressed_pictures_of_one_camera_are_one_camera(tmp_path):
-    ok, png = cv2.imencode(".png", _pixels(0))
+    ok, png = cv2.imencode(".png", bags.pixels(0))
     assert ok
     small = [
         ("/cam/image_raw/compressed", "sensor_msgs/msg/CompressedImage", t, bags.compressed(t, png.tobytes(), "png"))
         for t in _times(3)
     ]
-    path = bags.write_mcap(tmp_path / "a.mcap", _in_order(_pictures(_times(2)), small))
+    path = bags.write_mcap(tmp_path / "a.mcap", bags.in_order(bags.pictures(_times(2)), small))
     assert open_source(path).length == 2
     chosen = open_source(path, topics=["image=/cam/image_raw/compressed"])
-    np.testing.assert_array_equal(next(chosen.frames()).image, _pixels(0))
+    np.testing.assert_array_equal(next(chosen.frames()).image, bags.pixels(0))
 
 
 def test_depth_maps_are_no_camera(tmp_path):
@@ -100,11 +83,11 @@ def test_depth_maps_are_no_camera(tmp_path):
     depth = [("/depth/image", IMAGE, t, bags.picture(t, data, "16UC1")) for t in _times(2)]
     name, kind = "/cam/depth/compressedDepth", "sensor_msgs/msg/CompressedImage"
     packed = [(name, kind, t, bags.compressed(t, b"abc", "16UC1; compressedDepth png")) for t in _times(2)]
-    both = bags.write_mcap(tmp_path / "a.mcap", _in_order(_pictures(_times(3)), depth, packed))
+    both = bags.write_mcap(tmp_path / "a.mcap", bags.in_order(bags.pictures(_times(3)), depth, packed))
     assert open_source(both).length == 3
     with pytest.raises(SourceError, match="depth maps"):
         open_source(both, topics=[name])
-    only = bags.write_mcap(tmp_path / "b.mcap", _in_order(depth, packed))
+    only = bags.write_mcap(tmp_path / "b.mcap", bags.in_order(depth, packed))
     with pytest.raises(SourceError, match="depth maps only"):
         open_source(only)
 
@@ -113,7 +96,7 @@ def test_depth_maps_are_no_camera(tmp_path):
 def test_header_stamps_that_tell_no_time_are_replaced_by_receipt_and_said(tmp_path, sign, words):
     received = _times(9)
     headers = [abs(sign) * 2 * received[0] + sign * t for t in received]
-    source = open_source(bags.write_mcap(tmp_path / "a.mcap", _pictures(headers, received=received)))
+    source = open_source(bags.write_mcap(tmp_path / "a.mcap", bags.pictures(headers, received=received)))
     assert _stamps(source) == pytest.approx(received, abs=1e-6)
     assert words in _reasons(source)
 
@@ -123,7 +106,7 @@ def test_one_wild_stamp_and_a_clock_that_is_set_back_cost_no_picture(tmp_path):
     wild = list(true)
     wild[7] = 0.0
     wild[12:] = [t - 3600.0 for t in true[12:]]
-    path = bags.write_mcap(tmp_path / "a.mcap", _pictures(wild, received=[t + 0.01 for t in true]))
+    path = bags.write_mcap(tmp_path / "a.mcap", bags.pictures(wild, received=[t + 0.01 for t in true]))
     source = open_source(path)
     assert _stamps(source) == pytest.approx(true, abs=1e-4)
     assert "2 header stamps jump" in _reasons(source)  # the wild one, and the first after the clock was set
@@ -132,7 +115,7 @@ def test_one_wild_stamp_and_a_clock_that_is_set_back_cost_no_picture(tmp_path):
 def test_telemetry_of_another_clock_is_moved_to_the_pictures(tmp_path):
     times = _times(60)
     moving = [("/odom", ODOM, t, bags.odometry(t - 500.0, (t - BEGIN_S, 0, 0), 0.0, (1, 0, 0))) for t in times]
-    source = open_source(bags.write_mcap(tmp_path / "a.mcap", _in_order(_pictures(times, late_s=0.0), moving)))
+    source = open_source(bags.write_mcap(tmp_path / "a.mcap", bags.in_order(bags.pictures(times, late_s=0.0), moving)))
     assert source.telemetry[0].stamp_s == pytest.approx(times[0], abs=1e-3)
     assert "500 s apart" in _reasons(source)
 
@@ -140,7 +123,7 @@ def test_telemetry_of_another_clock_is_moved_to_the_pictures(tmp_path):
 @pytest.mark.parametrize("name", ["a.mcap", "a.bag"])
 @pytest.mark.parametrize("keep", [0, 5, 40, 0.5, 0.98])
 def test_a_truncated_file_is_refused_in_one_line_or_read_as_far_as_it_goes(tmp_path, name, keep):
-    path = WRITERS[name](tmp_path / name, _pictures(_times(4)))
+    path = WRITERS[name](tmp_path / name, bags.pictures(_times(4)))
     data = path.read_bytes()
     path.write_bytes(data[: keep if isinstance(keep, int) else int(keep * len(data))])
     with pytest.raises(SourceError) as caught:
@@ -150,7 +133,7 @@ def test_a_truncated_file_is_refused_in_one_line_or_read_as_far_as_it_goes(tmp_p
 
 @pytest.mark.parametrize("topic", ["/cam/image_rw", "odometry=/cam/image_raw", "odom=/cam/image_raw"])
 def test_wrong_topics_are_refused(tmp_path, topic):
-    path = bags.write_mcap(tmp_path / "a.mcap", _pictures(_times(2)))
+    path = bags.write_mcap(tmp_path / "a.mcap", bags.pictures(_times(2)))
     with pytest.raises(SourceError, match=topic.split("=")[0]):
         open_source(path, topics=[topic])
 
@@ -162,7 +145,7 @@ def test_several_odometries_are_not_guessed_between(tmp_path):
         for t in times
         for name, v in (("/truth", 2.0), ("/wheels", 1.0))
     ]
-    path = bags.write_mcap(tmp_path / "a.mcap", _in_order(_pictures(times), two))
+    path = bags.write_mcap(tmp_path / "a.mcap", bags.in_order(bags.pictures(times), two))
     source = open_source(path)
     assert source.telemetry == [] and "choose with --topic odom=/truth" in _reasons(source)
     chosen = open_source(path, topics=["odom=/wheels"])
@@ -171,7 +154,7 @@ def test_several_odometries_are_not_guessed_between(tmp_path):
 
 
 def test_a_folder_without_metadata_is_read_if_it_has_one_file(tmp_path):
-    folder = bags.write_ros2(tmp_path / "a", _pictures(_times(3)))
+    folder = bags.write_ros2(tmp_path / "a", bags.pictures(_times(3)))
     (folder / "metadata.yaml").unlink()
     assert open_source(folder).length == 3
     Path(folder / "b.mcap").write_bytes(b"")
@@ -181,7 +164,7 @@ def test_a_folder_without_metadata_is_read_if_it_has_one_file(tmp_path):
 
 def test_a_lens_that_ours_cannot_express_is_refused_in_one_line(tmp_path):
     wide = bags.camera_info((64, 48), 20.0, (-0.01, 0.02, -0.005, 0.001), "equidistant")
-    path = bags.write_mcap(tmp_path / "a.mcap", [("/cam/camera_info", INFO, BEGIN_S, wide), *_pictures(_times(2))])
+    path = bags.write_mcap(tmp_path / "a.mcap", [("/cam/camera_info", INFO, BEGIN_S, wide), *bags.pictures(_times(2))])
     with pytest.raises(CalibrationError, match="--camera FILE"):
         open_source(path)
     assert math.isfinite(open_source(path, camera=_any_camera(tmp_path)).camera.fx)

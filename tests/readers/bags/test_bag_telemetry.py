@@ -35,7 +35,7 @@ BODY = (1.0, 0.0, 0.1)
 
 def _read(tmp_path, *series, topics=()):
     pictures = [("/cam", IMAGE, t, bags.picture(t, np.zeros((8, 8), np.uint8), "mono8")) for t in TIMES[:2]]
-    events = sorted((e for s in (pictures, *series) for e in s), key=lambda e: e[2])
+    events = bags.in_order(pictures, *series)
     return open_bag(bags.write_mcap(tmp_path / "a.mcap", events), topics)
 
 
