@@ -72,14 +72,6 @@ def test_second_flight_is_in_the_map_of_the_first_at_once_and_in_its_metres(tmp_
     assert outputs[-1].metric
 
 
-def test_a_second_flight_adds_to_the_map(tmp_path):
-    slam, _ = second_flight(second_film().frames)
-    again = slam.saved_atlas("second")
-    assert again.flights == ("first", "second")
-    assert again.keyframes >= first_flight()[1].keyframes
-    assert len(again.scale) == 1 and again.scale[0].value == pytest.approx(1.0)
-
-
 def test_a_flight_elsewhere_has_a_map_of_its_own_and_both_are_saved():
     slam, outputs = second_flight(elsewhere().frames)
     assert {o.piece for o in outputs} == {1}

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import logging
 import os
 import pty
 import shlex
@@ -111,22 +110,6 @@ def test_mistake_gets_one_line_and_no_traceback(edgeslam, recording, tmp_path, w
     assert got == code
     (line,) = [line for line in err.splitlines() if "error:" in line]
     assert message in line and len(line) < 500 and "Traceback" not in err
-
-
-@pytest.mark.parametrize("verbose", [False, True])
-def test_warnings_are_printed_once_and_other_libraries_are_left_alone(verbose, edgeslam, monkeypatch):
-    from edgeslam_torch.commands import report
-
-    def warn(args):
-        logging.getLogger("edgeslam_torch.anything").warning("look out")
-        return 0
-
-    monkeypatch.setattr(report, "main", warn)
-    loggers = [logging.getLogger(name) for name in ("", "edgeslam_torch", "torch", "matplotlib")]
-    before = [(logger.level, list(logger.handlers)) for logger in loggers]
-    code, _, err = edgeslam("report", "somewhere", *(["-v"] if verbose else []))
-    assert code == 0 and err.count("look out") == 1
-    assert [(logger.level, list(logger.handlers)) for logger in loggers] == before
 
 
 def test_help_and_version(edgeslam):

@@ -65,9 +65,3 @@ def test_every_reading_is_given_once_up_to_the_frame_by_its_own_clock(offset_s):
     stamps_s = np.concatenate([part.stamps_s for part in given])
     assert stamps_s.tolist() == Source.imu_readings.stamps_s[: len(stamps_s)].tolist()
     assert told == Source.telemetry[:91]
-
-
-@pytest.mark.parametrize("wrong", [readings(1.0), [1.0], [np.zeros(7)]])
-def test_what_is_no_reading_is_refused(wrong):
-    with pytest.raises(TypeError, match="readings"):
-        check_readings(wrong)

@@ -126,22 +126,6 @@ def test_few_or_flat_views_are_doubted(rng):
         calibrate(pictures, Board(8, 6))
 
 
-def test_command_writes_a_file_that_every_command_reads(rng, tmp_path, capsys):
-    (tmp_path / "in").mkdir()
-    for name, image in views(rng, chessboard(), 8):
-        cv2.imwrite(str(tmp_path / "in" / name), image)
-    (tmp_path / "in" / "broken.png").write_bytes(b"no picture")
-    bomb = b"P5 17000 17000 255\n"
-    (tmp_path / "in" / "bomb.pgm").write_bytes(bomb)
-    out = tmp_path / "camera.yaml"
-    assert main(["calibrate", str(tmp_path / "in"), "--board", "8x6", "--out", str(out)]) == 0
-    assert load_camera(out).fx == pytest.approx(CAMERA.fx, rel=0.01)
-    text = capsys.readouterr().out
-    assert "broken.png: cannot be decoded" in text
-    assert "bomb.pgm: image is 17000x17000" in text
-    assert "reprojection error" in text
-
-
 @pytest.mark.parametrize(
     "arguments", [["nowhere"], ["--board", "8by6"], ["--board", "8x6", "--charuco", "9x7"], ["--aprilgrid", "1x1"]]
 )

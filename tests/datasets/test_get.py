@@ -121,17 +121,6 @@ def test_file_that_changed_between_two_pieces_is_fetched_anew(one, publisher, tm
     assert len(list(open_source(tmp_path / "rec" / "tum_fr1_a").frames())) == 6
 
 
-@pytest.mark.parametrize("algorithm", ["sha256", "md5"])
-def test_wrong_checksum_leaves_nothing(one, tmp_path, capsys, algorithm):
-    wrong = f"{algorithm}:" + "0" * hashlib.new(algorithm).digest_size * 2
-    one(tum(), checksum=wrong, checksum_by="publisher")
-    assert get(tmp_path, "tum_fr1_a") == 1
-    error = capsys.readouterr().err.strip()
-    assert "not the expected file; it was deleted" in error
-    assert "\n" not in error
-    assert list((tmp_path / "rec" / ".downloads").iterdir()) == []
-
-
 def test_missing_file_is_named_with_a_way_out_and_the_next_address_is_tried(one, publisher, tmp_path, capsys):
     one(tum(), urls=[f"{publisher.address}/gone.tgz"])
     assert get(tmp_path, "tum_fr1_a") == 1
@@ -154,20 +143,6 @@ def test_first_download_is_trusted_and_a_changed_second_one_is_not(one, publishe
     assert not target.exists()
 
 
-def test_archive_by_hand_is_checked_and_kept(one, tmp_path, capsys):
-    content = tum()
-    one(b"", checksum=f"sha256:{sha256(content)}", checksum_by="agreed")
-    archive = tmp_path / "mine.tgz"
-    archive.write_bytes(content)
-    assert get(tmp_path, "tum_fr1_a", "--archive", str(archive)) == 0
-    assert archive.exists()
-    (tmp_path / "rec" / "tum_fr1_a").rename(tmp_path / "rec" / "aside")
-    archive.write_bytes(tum(5))
-    assert get(tmp_path, "tum_fr1_a", "--archive", str(archive)) == 1
-    assert "expected" in capsys.readouterr().err
-    assert get(tmp_path, "tum_fr1_a", "--archive", str(tmp_path / "nowhere.tgz")) == 1
-
-
 def test_two_recordings_of_one_archive_are_one_download(shop, publisher, tmp_path):
     def scene(number):
         names = [f"frame-{i:06d}" for i in range(3)]
@@ -182,15 +157,6 @@ def test_two_recordings_of_one_archive_are_one_download(shop, publisher, tmp_pat
     assert len(publisher.requests) == 1
     for name in names:
         assert open_source(tmp_path / "rec" / name).groundtruth is not None
-
-
-def test_truth_of_its_own_archive_is_joined(shop, publisher, tmp_path):
-    publisher.files["/i.tgz"] = tgz({f"mono/ME000/{i:06d}.png": png(i) for i in range(3)})
-    publisher.files["/t.zip"] = zipped({"gt/mono_gt/ME000.txt": b"0 0 0 0 0 0 1\n" * 3})
-    fields = {"urls": [f"{publisher.address}/i.tgz"], "truth": f"{publisher.address}/t.zip"}
-    shop({**fields, "sequences": {"tartanair_me000": "mono/ME000"}}, layout="tartanair")
-    assert get(tmp_path, "tartanair_me000") == 0
-    assert open_source(tmp_path / "rec" / "tartanair_me000").groundtruth is not None
 
 
 def test_space_counts_an_archive_once_and_of_it_only_what_is_unpacked(shop, tmp_path):

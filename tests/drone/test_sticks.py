@@ -33,15 +33,6 @@ def held():
     sticks.stop()
 
 
-def test_a_controller_that_goes_on_is_not_disturbed(clock, held):
-    sticks, sent, look = held
-    for _ in range(5):
-        sticks.push(PUSHED, lambda: None)
-        clock.now += 0.9 * FRESH_S
-        look()
-    assert sent == [PUSHED] * 5
-
-
 def test_sticks_that_are_not_moved_are_centred_again_and_again_until_they_are(clock, held):
     sticks, sent, look = held
     sticks.push(PUSHED, lambda: None)

@@ -29,8 +29,3 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
         write_atomically(tmp_path / "a", fail)
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
     assert (tmp_path / "a").read_text() == "old"
-
-
-def test_file_name_that_is_no_unicode_does_not_stop_a_text(tmp_path):
-    write_text(tmp_path / "a.txt", "recording \udcff\n")
-    assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "recording ?\n"

@@ -44,19 +44,6 @@ def test_no_picture_or_bag_within_a_recording_is_replaced(parser, tmp_path, name
         _check(parser, tmp_path, "--json", path, "--overwrite")
 
 
-def test_results_in_the_folder_that_a_command_writes_are_replaced(tmp_path):
-    parser = argparse.ArgumentParser()
-    parser.add_argument("source")
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--save-mcap", type=output_file)
-    parser.add_argument("--camera", type=output_file, default=Path("camera.yaml"))
-    add_overwrite(parser)
-    for name in ("run.mcap", "camera.yaml"):
-        (tmp_path / name).touch()
-    _check(parser, "in", "--out", tmp_path, "--save-mcap", tmp_path / "run.mcap", "--overwrite")
-    _check(parser, tmp_path, "--camera", tmp_path / "camera.yaml", "--overwrite")  # what such a command makes
-
-
 @pytest.mark.parametrize("spelling", ["same", "relative", "symlink", "hard link"])
 def test_what_is_read_is_never_replaced(parser, tmp_path, monkeypatch, spelling):
     monkeypatch.chdir(tmp_path)

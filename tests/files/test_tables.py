@@ -43,16 +43,6 @@ def test_decimal_commas(tmp_path, separator, quote):
 
 
 @pytest.mark.parametrize(
-    "line", ["{} rgb/a b.png", "{}\trgb/a b.png", "{},rgb/a b.png", "{};rgb/a b.png", '{},"rgb/a b.png"']
-)
-def test_the_last_of_two_columns_is_text_with_blanks(tmp_path, line):
-    table = read_table(
-        written(tmp_path, "\n".join(line.format(x, "rgb/a b.png") for x in ("1.0", "1.5"))), SourceError, columns=2
-    )
-    assert [row.cells for row in table.rows] == [["1.0", "rgb/a b.png"], ["1.5", "rgb/a b.png"]]
-
-
-@pytest.mark.parametrize(
     ("content", "words"),
     [
         (b"t x\n1 2\n1 a\n", "line 3, column 2 (x)"),

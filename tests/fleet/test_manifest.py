@@ -67,14 +67,3 @@ def test_table_gives_each_flight_its_own_camera_truth_and_settings(tmp_path):
 def test_malformed_table_is_refused_with_its_line(tmp_path, text, message):
     with pytest.raises((ConfigError, SourceError), match=message):
         read_manifests([str(table(tmp_path, text))])
-
-
-@pytest.mark.parametrize("separator", [",", ";", "\t"])
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_a_table_is_read_as_a_spreadsheet_saves_it(tmp_path, separator, encoding):
-    lines = [["recording", "settings"], ["a.mp4", '"flow.enabled=false;seed=1"'], ["b.mp4", ""]]
-    path = tmp_path / "flights.csv"
-    path.write_bytes("\r\n".join(map(separator.join, lines)).encode(encoding))
-    first, second = read_manifests([str(path)])
-    assert first.settings == ("flow.enabled=false", "seed=1")
-    assert second.recording.name == "b.mp4"

@@ -103,17 +103,6 @@ def test_sigma_matches_the_error(found_and_true):
     assert 0.4 < spread < 2.0
 
 
-def test_arms_are_as_long_as_the_sides(found_and_true):
-    for found, truth in found_and_true:
-        mine, theirs = matched(found, truth)
-        sides = np.sort(np.linalg.norm(truth[theirs, 1:] - truth[theirs, :1], axis=2), axis=1)
-        assert np.median(np.abs(np.sort(found.length_px[mine], axis=1) - sides)) < 4.0
-        uv, fraction = found.arm_points(5)
-        assert uv.shape == (len(found), 2, 5, 2)
-        assert fraction.max() == 1.0
-        assert (np.linalg.norm(uv[:, :, -1] - found.uv[:, None], axis=2) <= 40.0 + 1e-9).all()
-
-
 def test_round_and_straight_contours_are_no_corners():
     image = np.full((480, 640), 60, np.uint8)
     cv2.circle(image, (200, 240), 90, 200, -1, cv2.LINE_AA)

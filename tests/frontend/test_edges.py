@@ -34,13 +34,6 @@ def test_thinning_respects_the_limit_and_preserves_coverage(most):
     assert crowded <= cells[1]
 
 
-def test_colour_is_rgb_of_the_pixel():
-    image = views()[0]
-    edges = extract_edges(image, 40.0, 100.0, 500)
-    u, v = edges.uv.astype(int).T
-    np.testing.assert_array_equal(edges.colour, image[v, u][:, ::-1])
-
-
 def in_the_dark(image, exposure, noise_grey):
     """The picture that a camera takes with so much less light: darker, as noisy as before, in whole grey levels."""
     noisy = exposure * image + noise_grey * np.random.default_rng(3).standard_normal(image.shape)

@@ -12,7 +12,7 @@ from edgeslam_torch.geometry import se3_torch as lie
 from edgeslam_torch.losses.base import ResidualLoss, back_project, move, project
 from edgeslam_torch.losses.cycle import CycleForm, CycleLoss
 from edgeslam_torch.losses.edge_alignment import EdgeAlignmentLoss
-from edgeslam_torch.losses.lshape import AngleForm, AngleLoss, CollinearityLoss, LShapeLoss, cosine
+from edgeslam_torch.losses.lshape import AngleForm, AngleLoss, CollinearityLoss, cosine
 from edgeslam_torch.losses.reprojection import ReprojectionLoss
 from edgeslam_torch.losses.robust import Kernel, rho
 
@@ -132,24 +132,6 @@ def test_gradient_under_a_kernel_is_twice_weighted_jacobian_times_residual(case,
     cost, weight = rho(r.square().sum(-1), kernel, loss.delta)
     expected = 2.0 * torch.einsum("n,nr,nrk->k", weight, r, J) * loss(*case.arguments(*OFF)) / cost.sum()
     torch.testing.assert_close(gradient, expected.detach(), rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("literal", [False, True])
-def test_lshape_is_the_weighted_sum_of_its_terms_and_so_is_its_gradient(literal, rng):
-    w = world(rng)
-    corners, arms_j = w["uv"].view(8, 3, 2), w["uv_j"].view(8, 3, 2)
-    cos_j, _ = cosine(arms_j[:, 1] - arms_j[:, 0], arms_j[:, 2] - arms_j[:, 0])
-    arms = torch.tensor(rng.normal(size=(4, 2, 5, 3)) + [0, 0, 4], dtype=torch.float64, requires_grad=True)
-    depth = (1.05 * w["depth"].view(8, 3)).requires_grad_()
-    loss = LShapeLoss.literal(0.3, 2.0) if literal else LShapeLoss(AngleLoss(), CollinearityLoss(), 0.3, 2.0)
-    angle = 0.3 * loss.angle(w["T_j_i"], corners, depth, cos_j, K)
-    straight = 2.0 * loss.collinearity(arms)
-    total = loss(w["T_j_i"], corners, depth, cos_j, K, arms)
-    torch.testing.assert_close(total, angle + straight)
-    torch.testing.assert_close(
-        torch.autograd.grad(total, (depth, arms)),
-        (torch.autograd.grad(angle, depth)[0], torch.autograd.grad(straight, arms)[0]),
-    )
 
 
 @pytest.mark.parametrize("case", NAMES, indirect=True)

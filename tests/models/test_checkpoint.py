@@ -28,15 +28,6 @@ def test_weights_and_record_come_back(tmp_path):
     assert list(tmp_path.iterdir()) == [tmp_path / "w.safetensors"]
 
 
-def test_plain_torch_state_dict_is_read_as_upstreams(tmp_path):
-    network = FastDepth(Variant.PRUNED)
-    torch.save(network.state_dict(), tmp_path / "w.pt")
-    loaded, metadata = load_checkpoint(tmp_path / "w.pt")
-    assert metadata.variant == Variant.PRUNED.value
-    assert metadata.output == "depth"
-    assert torch.equal(loaded.state_dict()["conv3.3.weight"], network.state_dict()["conv3.3.weight"])
-
-
 @pytest.mark.parametrize(
     ("prefix", "key"),
     [("module.", None), ("_orig_mod.", "model"), ("model._orig_mod.module.", "state_dict"), ("", "model_state_dict")],

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from edgeslam_torch.errors import ConfigError, WeightsError
+from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.frontend.depth_network import DepthPredictor, open_depth
 from edgeslam_torch.frontend.onnx_session import open_session
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
 from edgeslam_torch.models.fastdepth import Widths
-from edgeslam_torch.models.onnx.graph import build_graph
 from edgeslam_torch.models.record import Metadata
 
 METADATA = Metadata(input_height=64, input_width=96, focal_px=80.0)
@@ -28,13 +27,6 @@ def weights(tmp_path_factory):
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "w.safetensors"
     save_checkpoint(build_network(METADATA, SMALL).eval(), METADATA, path)
-    return path
-
-
-@pytest.fixture
-def exported(weights, tmp_path):
-    path = tmp_path / "w.onnx"
-    path.write_bytes(build_graph(weights)[0])
     return path
 
 
@@ -73,17 +65,6 @@ def test_a_device_that_is_not_there_is_refused_and_not_replaced(weights, backend
     without_gpu(monkeypatch)
     with pytest.raises(ConfigError, match=rf"--device {device}: .*no such device; use --device cpu"):
         open_depth(weights, backend, device=device)
-
-
-def test_an_onnx_file_needs_onnxruntimes_cuda(exported, monkeypatch):
-    """Also where torch has it: the file does not run there."""
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    with pytest.raises(ConfigError, match="has no CUDA; install onnxruntime-gpu"):
-        open_depth(exported, device="cuda")
-    with pytest.raises(ConfigError, match="ONNX files run on cpu or cuda"):
-        open_depth(exported, device="mps")
-    with pytest.raises(WeightsError, match="runs in onnxruntime only"):
-        open_depth(exported, "torch", device="cuda")
 
 
 @pytest.mark.parametrize(

@@ -74,12 +74,6 @@ def test_wrong_checksum_leaves_nothing(server, tmp_path):
 # -- trust on first use --------------------------------------------------------------------------------------------
 
 
-def test_where_https_does_not_answer_http_is_taken_and_known_as_such(server, tmp_path):
-    fetched = download((f"{server}/file".replace("http:", "https:"), f"{server}/file"), tmp_path / "w")
-    assert fetched.url == f"{server}/file"
-    assert not fetched.encrypted
-
-
 def test_a_file_that_changed_since_the_first_download_is_not_taken(server, tmp_path):
     first = download((f"{server}/file",), tmp_path / "w")
     remember(tmp_path / "w", first.sha256)

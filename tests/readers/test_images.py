@@ -38,12 +38,6 @@ def test_a_jpeg_is_read_in_grey_and_in_colour_when_asked(entry):
     assert abs(off.mean()) < 0.5
 
 
-def test_another_format_is_decoded_once(entry):
-    frame = read_frame(entry("a.png", picture()))
-    np.testing.assert_array_equal(frame.image, picture())
-    assert frame.grey is None
-
-
 def test_a_jpeg_that_is_none_or_of_another_size_is_left_out(entry, tmp_path):
     good, small = entry("a.jpg", picture()), entry("b.jpg", picture()[:40])
     broken, cut = tmp_path / "c.jpg", tmp_path / "d.jpg"

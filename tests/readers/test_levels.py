@@ -32,13 +32,6 @@ def test_a_hot_pixel_does_not_set_the_range():
     assert np.abs(levels_of([deep]).eight_bits(deep)[6:].astype(int) - GREY[6:]).max() == 0
 
 
-@pytest.mark.parametrize("picture", [np.zeros((4, 4), np.uint16), np.full((4, 4), np.nan, np.float32)])
-def test_pictures_without_contrast_say_nothing(picture):
-    levels = levels_of([picture])
-    assert (levels.black, levels.white) == (0.0, 65536.0)
-    assert not levels.eight_bits(picture).any()
-
-
 @pytest.mark.parametrize("odd", [[0], [65535], [0] * 15, [8000], [65535, 0, 0]])
 def test_pictures_of_a_closed_shutter_do_not_set_the_range(odd):
     thermal = (7000 + 1.5 * GREY).astype(np.uint16)

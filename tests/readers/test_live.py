@@ -1,7 +1,6 @@
 import signal
 import threading
 
-import cv2
 import numpy as np
 import pytest
 
@@ -9,7 +8,7 @@ from edgeslam_torch.cli import main
 from edgeslam_torch.drone.emulator.server import TelloEmulator
 from edgeslam_torch.drone.video_stream import Picture
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.readers.live import CaptureFeed, LiveSource
+from edgeslam_torch.readers.live import LiveSource
 
 
 class FakeFeed:
@@ -76,26 +75,6 @@ def test_a_source_that_is_ended_stops_while_it_waits():
     assert feed.closed == 1
 
 
-def test_remarks_on_what_came_are_warnings_once():
-    source = LiveSource("webcam:0", FakeFeed([1]), [], None, None, is_drone=False)
-    assert len(list(source.frames())) == 1
-    source.close()
-    assert [w for w in source.warnings if "refused" in w] == ["webcam:0: 3 packets refused"]
-
-
-def test_capture_gives_pictures_with_arrival_times(tmp_path):
-    path = tmp_path / "clip.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, (64, 48))
-    for k in range(10):
-        writer.write(np.full((48, 64, 3), 20 * k, np.uint8))
-    writer.release()
-    feed = CaptureFeed(str(path), "clip")
-    picture = feed.wait(0, 5.0)
-    assert picture.image.shape == (48, 64, 3)
-    feed.close()
-    assert threading.active_count() < 50
-
-
 @pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.timeout(120)
@@ -110,9 +89,3 @@ def test_emulator_ends_whichever_of_its_threads_gets_the_signal(capsys, monkeypa
     monkeypatch.setattr(TelloEmulator, "start", shot)
     ports = ["--command-port", "0", "--state-port", "1", "--video-port", "1"]
     assert main(["sim", *ports, "--render-width", "64"]) == 0
-
-
-@pytest.mark.parametrize("wrong", [["--loss", "100"], ["--battery", "0"], ["--render-width", "5000"]])
-def test_emulator_command_refuses_in_one_line(wrong, capsys):
-    assert main(["sim", *wrong]) == 1
-    assert len(capsys.readouterr().err.strip().splitlines()) == 1

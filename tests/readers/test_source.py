@@ -1,7 +1,5 @@
 """Every kind of source, good and bad."""
 
-import threading
-
 import cv2
 import numpy as np
 import pytest
@@ -99,14 +97,6 @@ def video(tmp_path, rng):
     return path
 
 
-def test_video(video):
-    source = open_source(video)
-    frames = list(source.frames())
-    assert [f.stamp_s for f in frames] == pytest.approx([0.04 * i for i in range(8)])
-    assert (source.kind, source.length) == ("video", 8)
-    assert frames[0].image.shape == (48, 64, 3)
-
-
 def test_cut_off_video_gives_what_it_has(video):
     video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
     source = open_source(video)
@@ -161,21 +151,7 @@ def test_what_is_no_source_is_refused_with_the_reason(tmp_path, files, source, s
 # -- calibration -------------------------------------------------------------------------------------------------
 
 
-def test_lens_that_turns_back_in_the_corners_is_used_with_a_warning(tmp_path, write_tum):
-    folder = write_tum(tmp_path, 2)
-    save_camera(folder / "camera.yaml", Camera(64, 48, 40.0, 40.0, 31.5, 23.5, (-0.3, 0.0, 0.0, 0.0, 0.0)))
-    assert "turns back at 70 % of the way to the border" in open_source(folder).warnings[0]
-
-
 # -- read-ahead --------------------------------------------------------------------------------------------------
-
-
-def test_leaving_early_leaves_no_thread(tmp_path, write_tum):
-    before = threading.active_count()
-    frames = open_source(write_tum(tmp_path, 20)).frames()
-    next(frames)
-    frames.close()
-    assert threading.active_count() == before
 
 
 def write_y4m(path, count):

@@ -37,11 +37,3 @@ def test_those_of_a_replaced_run_go_and_files_of_others_stay(tmp_path):
     _played(tmp_path, range(3), {2})
     assert list(kept_images(tmp_path)) == [102.0]
     assert (tmp_path / "images" / "notes.jpg").read_bytes() == b"mine"
-
-
-def test_a_link_in_place_of_the_folder_is_not_followed(tmp_path):
-    (tmp_path / "others").mkdir()
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "images").symlink_to(tmp_path / "others")
-    _played(tmp_path / "run", range(2), {0})
-    assert not list((tmp_path / "others").iterdir())

@@ -121,13 +121,6 @@ def test_a_folder_with_what_no_run_wrote_is_refused_and_left_alone(tmp_path, nam
     assert contents(tmp_path) == before
 
 
-def test_a_recording_is_refused_although_a_run_of_old_wrote_into_it(tmp_path):
-    leave_run(tmp_path)
-    (tmp_path / "rgb").mkdir()
-    with pytest.raises(OutputError, match="holds rgb, which no run wrote"):
-        RunWriter(tmp_path)
-
-
 KILLED = """
 import sys, time
 from pathlib import Path

@@ -8,8 +8,6 @@ from edgeslam_torch.drone.emulator.link import LinkFaults
 from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
 from edgeslam_torch.drone.tello import StateMessage
 from edgeslam_torch.drone.video_stream import Picture
-from edgeslam_torch.errors import OutputError
-from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.readers.live import LiveSource, open_tello
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.writers import flight_writer, tee
@@ -94,11 +92,3 @@ class ManyPictures:
 
     def close(self):
         self.closed += 1
-
-
-def test_a_run_or_half_a_recording_is_not_written_over(tmp_path):
-    (tmp_path / "camera.yaml").write_text("mine")
-    with pytest.raises(OutputError, match="holds camera.yaml already"):
-        flight_writer.FlightWriter(tmp_path, PRESETS["tello"], with_telemetry=True)
-    assert [path.name for path in tmp_path.iterdir()] == ["camera.yaml"]
-    assert (tmp_path / "camera.yaml").read_text() == "mine"

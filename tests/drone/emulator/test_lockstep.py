@@ -65,16 +65,6 @@ def test_hitting_a_wall_is_an_event_with_its_speed():
     assert drone.p_w[0] == pytest.approx(0.9, abs=0.02)
 
 
-def test_a_slow_touch_bounces_and_flies_on():
-    wall = DroneModel(clearance=lambda p: 1.0 - p[0])
-    commands = ((0.0, "takeoff"), (4.0, "rc 0 30 0 0"), (7.4, "rc 0 0 0 0"))
-    events, drone = flown(9.0, drone=wall, commands=commands)
-    touches = [e for e in events if isinstance(e, Contact)]
-    assert touches and not any(t.crashed for t in touches)
-    assert drone.mode is Mode.FLYING
-    assert drone.p_w[0] < 0.91
-
-
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
 def test_time_that_does_not_pass_is_refused(seconds):
     with pytest.raises(ValueError, match="step"):

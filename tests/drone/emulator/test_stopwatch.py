@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.drone.emulator import room
-from edgeslam_torch.drone.emulator.stopwatch import PERIOD_S, age_s, draw_time, read_time
+from edgeslam_torch.drone.emulator.stopwatch import draw_time, read_time
 from edgeslam_torch.synthetic.sites.build import named_site
 
 
@@ -12,11 +12,6 @@ def test_a_time_is_read_back_from_a_noisy_picture(rng, time_s):
     draw_time(image, time_s)
     noisy = np.clip(image + rng.normal(0, 25, image.shape), 0, 255).astype(np.uint8)
     assert read_time(noisy) == pytest.approx(time_s)
-
-
-def test_ages_pass_over_the_end_of_the_period():
-    shown = 7 * PERIOD_S - 0.010
-    assert age_s(shown % PERIOD_S, shown + 0.35) == pytest.approx(0.35)
 
 
 def test_the_room_is_painted_where_the_drone_is(monkeypatch):

@@ -25,11 +25,6 @@ def test_a_shipped_network_is_made_once(cache):
     assert list(cache.iterdir()) == [file]
 
 
-def test_a_cache_that_cannot_be_written_costs_time_only(cache):
-    cache.write_text("a file where the folder should be")
-    assert cached_graph(DEFAULT_WEIGHTS) == build_graph(DEFAULT_WEIGHTS)
-
-
 def test_weights_of_the_users_own_leave_nothing(cache, tmp_path):
     own = tmp_path / "tuned.safetensors"
     shutil.copy(DEFAULT_WEIGHTS, own)

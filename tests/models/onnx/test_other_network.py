@@ -56,15 +56,6 @@ def test_other_network_gives_the_slam_metres_for_its_camera(tmp_path):
     np.testing.assert_allclose(depth.sigma_log, 0.1, rtol=1e-5)
 
 
-def test_the_end_of_a_networks_range_is_unknown_not_100_m(tmp_path):
-    predict = DepthPredictor(write_green_network(tmp_path / "far.onnx", metres=99.0))
-    image = np.zeros((128, 192, 3), np.uint8)
-    image[:, :96, 1] = 255
-    depth_m = predict(image, Camera(192, 128, 160.0, 160.0, 95.5, 63.5)).depth_m
-    assert np.isnan(depth_m[:, :90]).all()
-    np.testing.assert_allclose(depth_m[:, 102:], 1.0, rtol=1e-5)
-
-
 def test_weights_without_a_graph_cannot_be_another_network(tmp_path):
     widths = Widths((8, 8) + (16,) * 12, (16, 16, 16, 8, 8))
     fastdepth = Metadata(input_height=64, input_width=96, focal_px=80.0)

@@ -92,18 +92,6 @@ def test_a_bag_that_is_still_being_written_names_the_remedy(tmp_path):
         open_source(path)
 
 
-def test_sixteen_bits_of_a_thermal_camera_are_read_where_the_topic_is_named(tmp_path):
-    data = (7000 + 100 * np.arange(48 * 64).reshape(48, 64) % 1500).astype(np.uint16)
-    times = [BEGIN_S + i / 30 for i in range(3)]
-    path = bags.write_mcap(tmp_path / "a.mcap", [("/t/image", IMAGE, t, bags.picture(t, data, "16UC1")) for t in times])
-    with pytest.raises(SourceError, match="--topic /t/image"):
-        open_source(path)
-    source = open_source(path, topics=["/t/image"])
-    image = next(iter(source.frames())).image
-    assert image.dtype == np.uint8 and np.ptp(image.astype(int)) > 10
-    assert any("16UC1" in problem.reason for problem in source.problems)
-
-
 def _database(tmp_path):
     bags.write_ros2(tmp_path / "made", _pictures(0, 3))
     path = tmp_path / "a.db3"

@@ -71,16 +71,6 @@ def test_yuv_orders():
         assert np.abs(_read(encoding, data, 2, 1).astype(int) - RED).max() <= 3, encoding
 
 
-def test_jpeg_and_png():
-    picture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8), (0, 0), 4)
-    for suffix, most in ((".png", 0), (".jpg", 12)):
-        ok, data = cv2.imencode(suffix, picture)
-        assert ok
-        message = SimpleNamespace(format=f"bgr8; {suffix[1:]} compressed bgr8", data=data.ravel())
-        got = PictureDecoder("x").decode(message)
-        assert np.abs(got.astype(int) - picture).max() <= most
-
-
 def test_what_is_no_picture_is_refused_in_one_line():
     assert depth_format(_message("16UC1", [0] * 4, 1, 1)) == "16UC1"
     with pytest.raises(SourceError, match="depth maps"):

@@ -1,14 +1,11 @@
 """Bags written by others' libraries, read as sources."""
 
-import math
-from pathlib import Path
-
 import bag_files as bags
 import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.errors import CalibrationError, SourceError
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.source import open_source
 
 pytest.importorskip("rosbags")
@@ -45,14 +42,6 @@ def test_each_format_gives_the_pictures_stamps_and_calibration_that_were_written
     assert camera.distortion == (0.05, -0.02, 0.001, -0.002, 0.01)
     assert source.kind == "bag" and source.length == 5 and source.warnings == []
     assert len(list(source.frames())) == 5  # a second time
-
-
-def test_missing_and_empty_camera_info_are_said(tmp_path):
-    without = open_source(bags.write_mcap(tmp_path / "a.mcap", bags.pictures(_times(2))))
-    assert "no calibration found" in without.warnings[0]
-    info = ("/cam/camera_info", INFO, BEGIN_S, bags.camera_info((64, 48), 0.0))
-    empty = open_source(bags.write_mcap(tmp_path / "b.mcap", [info, *bags.pictures(_times(2))]))
-    assert "no calibration found" in empty.warnings[0] and "empty calibration" in _reasons(empty)
 
 
 def test_two_cameras_are_named_and_one_is_asked_for(tmp_path):
@@ -151,26 +140,3 @@ def test_several_odometries_are_not_guessed_between(tmp_path):
     chosen = open_source(path, topics=["odom=/wheels"])
     assert chosen.telemetry[5].velocity_m_s == pytest.approx([1.0, 0.0, 0.0])
     assert open_source(path, topics=["odom=none"]).telemetry == []
-
-
-def test_a_folder_without_metadata_is_read_if_it_has_one_file(tmp_path):
-    folder = bags.write_ros2(tmp_path / "a", bags.pictures(_times(3)))
-    (folder / "metadata.yaml").unlink()
-    assert open_source(folder).length == 3
-    Path(folder / "b.mcap").write_bytes(b"")
-    with pytest.raises(SourceError, match=r"no metadata.yaml beside a.db3, b.mcap"):
-        open_source(folder)
-
-
-def test_a_lens_that_ours_cannot_express_is_refused_in_one_line(tmp_path):
-    wide = bags.camera_info((64, 48), 20.0, (-0.01, 0.02, -0.005, 0.001), "equidistant")
-    path = bags.write_mcap(tmp_path / "a.mcap", [("/cam/camera_info", INFO, BEGIN_S, wide), *bags.pictures(_times(2))])
-    with pytest.raises(CalibrationError, match="--camera FILE"):
-        open_source(path)
-    assert math.isfinite(open_source(path, camera=_any_camera(tmp_path)).camera.fx)
-
-
-def _any_camera(folder):
-    path = folder / "camera.yaml.mine"
-    path.write_text("width: 64\nheight: 48\nfx: 70\nfy: 70\ncx: 31\ncy: 23\n")
-    return path

@@ -85,12 +85,6 @@ def test_a_twist_is_turned_by_the_attitude_unless_it_is_in_the_world(tmp_path):
     assert alone.telemetry == [] and any("without any attitude" in remark for remark in alone.remarks)
 
 
-def test_an_imu_that_measures_no_attitude_is_not_used(tmp_path):
-    for known in (False, True):  # covariance -1, and a constant
-        bag = _read(tmp_path, [("/imu", IMU, t, bags.imu(t, 0.3, known=known)) for t in TIMES])
-        assert bag.telemetry == [] and any("holds no attitude" in remark for remark in bag.remarks)
-
-
 def test_range_and_battery_join_the_velocities(tmp_path):
     def reading(t, metres):
         extra = {"radiation_type": 1, "field_of_view": 0.1, "min_range": 0.1, "max_range": 4.0, "range": metres}

@@ -91,17 +91,6 @@ def test_euroc_mount_is_the_relative_pose_of_both_sensors(tmp_path):
         assert model.time_offset_s == 0.0 and len(readings) == 400 and not said
 
 
-def test_given_files_come_before_those_of_the_folder(tmp_path):
-    (tmp_path / "imu.csv").write_text(HEADER + ROWS)
-    (tmp_path / "imu.yaml").write_text(OURS)
-    (tmp_path / "other.csv").write_text(HEADER + ROWS[: len(ROWS) // 2].rpartition("\n")[0] + "\n")
-    (tmp_path / "other.yaml").write_text(text_of(time_offset_s=0.01))
-    given = Given(tmp_path / "other.csv", tmp_path / "other.yaml")
-    model, readings, said = found(tmp_path, given)
-    assert len(readings) < 250 and model.time_offset_s == 0.01 and model.T_imu_cam is None
-    assert any("missing for 1.0 s" in line for line in said)
-
-
 def test_kinect_readings_have_a_mount_and_no_gyroscope(tmp_path):
     (tmp_path / "accelerometer.txt").write_text("# timestamp ax ay az\n10.0 1 9 3\n10.01 1 9 3\n")
     model, readings, said = found(tmp_path, span=(10.0, 10.0))

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.errors import CalibrationError, SourceError
-from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.readers.source import open_source
 
 CALIB = "P0: 700 0 31.5 0 0 701 23.5 0 0 0 1 0\nP2: 710 0 30.5 44.8 0 711 22.5 0.2 0 0 1 0.003\n"
@@ -35,14 +34,6 @@ def test_colour_camera_goes_before_the_grey_one_each_with_its_own_matrix(sequenc
     assert (open_source(sequence).camera.fx, open_source(sequence).camera.cy) == (710.0, 22.5)
     (sequence / "image_2").rename(sequence / "image_0")
     assert (open_source(sequence).camera.fx, open_source(sequence).camera.cy) == (700.0, 23.5)
-
-
-def test_evaluation_reads_the_same_clock(sequence):
-    dataset = open_dataset(sequence)
-    np.testing.assert_allclose(dataset.truth.stamps_s, [0.0, 0.1, 0.2, 0.3])
-    np.testing.assert_allclose(dataset.truth.positions[:, 2], [0.0, 1.0, 2.0, 3.0])
-    np.testing.assert_allclose(dataset.frame_stamps_s, [0.0, 0.1, 0.3])
-    assert dataset.truth.stamped and dataset.camera is not None and dataset.camera.fy == 711.0
 
 
 def test_bad_files_are_named(sequence):

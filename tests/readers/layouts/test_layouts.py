@@ -6,24 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.readers import layouts as package
 from edgeslam_torch.readers.layouts import layouts
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.train.views.datasets import load_depth_folder
-
-
-@pytest.mark.parametrize(
-    ("name", "fx"), [("rgbd_dataset_freiburg1_desk", 517.306408), ("tum_fr2_desk", 520.908620), ("fr12_desk", None)]
-)
-def test_evaluation_and_slam_take_the_same_camera(tmp_path, write_tum, name, fx):
-    folder = write_tum(tmp_path / name, 2, (640, 480))
-    (folder / "groundtruth.txt").write_text("100.0 0 0 0 0 0 0 1\n100.1 1 0 0 0 0 0 1\n")
-    camera = open_dataset(folder).camera
-    assert (None if camera is None else camera.fx) == fx
-    assert open_source(folder).camera.fx == (fx or 1.2 * 640)
-
 
 GARDEN = """
 import numpy as np
@@ -99,11 +86,3 @@ def test_stamps_of_a_layout_may_be_in_any_unit(tmp_path, write_images, kind, fac
     stamps = [frame.stamp_s for frame in source.frames()]
     assert source.kind == kind.split(",")[0]
     assert np.allclose(stamps, [1305031102.2 + i / 30 for i in range(12)], atol=2e-3)
-
-
-@pytest.mark.parametrize("rows", [["0.1"], ["a 0.1", "b 0.2"]])
-def test_times_that_do_not_fit_the_images_are_refused(tmp_path, write_images, rows):
-    write_images(tmp_path / "images", [f"{i}.png" for i in range(4)])
-    (tmp_path / "times.txt").write_text("\n".join(rows))
-    with pytest.raises(SourceError, match="times.txt"):
-        open_source(tmp_path)
