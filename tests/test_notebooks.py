@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
 nbformat = pytest.importorskip("nbformat", reason="nbformat is not installed")
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parent.parent / "examples" / "notebooks").glob("*.ipynb"))
@@ -20,6 +19,7 @@ def outputs(book):
 
 def run(path):
     """Execute a copy; its text."""
+    nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
     book = nbformat.read(path, as_version=4)
     nbclient.NotebookClient(book, timeout=280, resources={"metadata": {"path": str(path.parent)}}).execute()
     text, pictures = outputs(book)

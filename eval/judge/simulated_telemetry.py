@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import lfilter
 
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.geometry.mount import camera_on_body
@@ -102,6 +101,8 @@ def _other_flight(drawn: Drawn) -> Samples:
 
 def _random_velocities(drawn: Drawn) -> Samples:
     """Random velocities and no height; the attitude is correct."""
+    from scipy.signal import lfilter  # loads half of scipy
+
     samples = _rounded(drawn)
     rng, none = np.random.default_rng([drawn.draw, 1]), dict.fromkeys(HEIGHTS, float("nan"))
     steps = np.sqrt(1.0 - _MEMORY**2) * _SPEED_M_S * rng.standard_normal((len(samples), 3))

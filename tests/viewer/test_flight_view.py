@@ -1,5 +1,7 @@
 """A flight in rerun: what is shown is what the pilot knows."""
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.viewer.flight_view import FlightView
 
-pytest.importorskip("rerun", reason="the viewer extra is not installed")
+pytestmark = pytest.mark.skipif(find_spec("rerun") is None, reason="the viewer extra is not installed")
 
 
 class Stream:

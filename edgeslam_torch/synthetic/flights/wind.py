@@ -2,7 +2,6 @@
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.signal import lfilter
 
 from edgeslam_torch.types import FloatArray
 
@@ -52,4 +51,6 @@ def blown(
 
 def correlated(steps: FloatArray, keep: float) -> FloatArray:
     """Noise with a memory, from zero on: ``keep`` times the value before plus a step, along the first axis."""
+    from scipy.signal import lfilter  # loads half of scipy
+
     return np.asarray(lfilter([1.0], [1.0, -keep], np.concatenate([0.0 * steps[:1], steps[1:]]), axis=0))
