@@ -12,8 +12,7 @@ _HOMES = {
     "recipes.finetune": "Data FromRuns finetune",
     "hooks": "Drawn Hooks named_hooks",
     "state": "TrainConfig TrainState",
-    "folder": "Existing OutFolder out_folder",
-    "result": "TrainingResult",
+    "folder": "Existing OutFolder TrainingResult out_folder",
     "processes.distributed": "process_group rank world",
     "loop": "DivergedError NonFiniteLossError Validation train",
     "self_supervised": "SelfSupervised SelfSupervisedWeights",
@@ -21,11 +20,9 @@ _HOMES = {
     "validate": "DepthScores image_tensor predict_metres score",
     "views.augment": "AugmentConfig View fitted_view random_view",
     "views.datasets": "DepthFolder load_depth_folder",
-    "views.edge_pixels": "edge_pixels",
-    "views.junctions": "junction_points seen_cosines",
+    "views.edges": "edge_pixels junction_points seen_cosines straight_edges",
     "views.posed": "PosedSequence PosedView load_run relative_motion",
     "views.shards": "load_shards write_shards",
-    "views.straight": "straight_edges",
     "callbacks": "ProgressBar TensorBoard",
 }
 _LAZY = {name: f"edgeslam_torch.train.{home}" for home, names in _HOMES.items() for name in names.split()}

@@ -2,6 +2,7 @@ from edgeslam_torch.train.callbacks import ProgressBar as ProgressBar
 from edgeslam_torch.train.callbacks import TensorBoard as TensorBoard
 from edgeslam_torch.train.folder import Existing as Existing
 from edgeslam_torch.train.folder import OutFolder as OutFolder
+from edgeslam_torch.train.folder import TrainingResult as TrainingResult
 from edgeslam_torch.train.folder import out_folder as out_folder
 from edgeslam_torch.train.hooks import Drawn as Drawn
 from edgeslam_torch.train.hooks import Hooks as Hooks
@@ -16,7 +17,6 @@ from edgeslam_torch.train.processes.distributed import world as world
 from edgeslam_torch.train.recipes.finetune import Data as Data
 from edgeslam_torch.train.recipes.finetune import FromRuns as FromRuns
 from edgeslam_torch.train.recipes.finetune import finetune as finetune
-from edgeslam_torch.train.result import TrainingResult as TrainingResult
 from edgeslam_torch.train.self_supervised import SelfSupervised as SelfSupervised
 from edgeslam_torch.train.self_supervised import SelfSupervisedWeights as SelfSupervisedWeights
 from edgeslam_torch.train.signals import Signal as Signal
@@ -36,13 +36,13 @@ from edgeslam_torch.train.views.augment import fitted_view as fitted_view
 from edgeslam_torch.train.views.augment import random_view as random_view
 from edgeslam_torch.train.views.datasets import DepthFolder as DepthFolder
 from edgeslam_torch.train.views.datasets import load_depth_folder as load_depth_folder
-from edgeslam_torch.train.views.edge_pixels import edge_pixels as edge_pixels
-from edgeslam_torch.train.views.junctions import junction_points as junction_points
-from edgeslam_torch.train.views.junctions import seen_cosines as seen_cosines
+from edgeslam_torch.train.views.edges import edge_pixels as edge_pixels
+from edgeslam_torch.train.views.edges import junction_points as junction_points
+from edgeslam_torch.train.views.edges import seen_cosines as seen_cosines
+from edgeslam_torch.train.views.edges import straight_edges as straight_edges
 from edgeslam_torch.train.views.posed import PosedSequence as PosedSequence
 from edgeslam_torch.train.views.posed import PosedView as PosedView
 from edgeslam_torch.train.views.posed import load_run as load_run
 from edgeslam_torch.train.views.posed import relative_motion as relative_motion
 from edgeslam_torch.train.views.shards import load_shards as load_shards
 from edgeslam_torch.train.views.shards import write_shards as write_shards
-from edgeslam_torch.train.views.straight import straight_edges as straight_edges

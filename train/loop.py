@@ -23,9 +23,8 @@ from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.hooks import Drawn, Hooks
 from edgeslam_torch.train.processes.device import arithmetic
-from edgeslam_torch.train.processes.distributed import add_up, by_first, everyones, rank, world
+from edgeslam_torch.train.processes.distributed import add_up, by_first, everyones, rank, share_norms, world
 from edgeslam_torch.train.processes.loading import drawn
-from edgeslam_torch.train.processes.shared_norm import share_norms
 from edgeslam_torch.train.signals import Signal, Slot
 from edgeslam_torch.train.state import TrainConfig, TrainState, resume, save_state, saved_step
 

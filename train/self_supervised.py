@@ -21,9 +21,8 @@ from edgeslam_torch.models.trainable import Prediction
 from edgeslam_torch.train.signals import Slot
 from edgeslam_torch.train.validate import image_tensor
 from edgeslam_torch.train.views.augment import AugmentConfig, View, recolour, scaled_K, warp
-from edgeslam_torch.train.views.junctions import junction_points, seen_cosines
+from edgeslam_torch.train.views.edges import junction_points, seen_cosines, straight_edges
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView, relative_motion
-from edgeslam_torch.train.views.straight import straight_edges
 from edgeslam_torch.types import FloatArray
 
 EDGES = 600

@@ -20,9 +20,8 @@ import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.conditions import code_state, machine, orb_pass_ms, stamp
-from edgeslam_torch.eval.experiment.figures import Figure, grouped
+from edgeslam_torch.eval.experiment.figures import Figure, grouped, markdown_table
 from edgeslam_torch.eval.experiment.runner import MODULE, Local, Task, run_tasks
-from edgeslam_torch.eval.experiment.tables import markdown_table
 from edgeslam_torch.eval.inputs.dataset import find_recordings
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 from edgeslam_torch.files.atomic import write_text

@@ -10,8 +10,7 @@ from typing import Any
 from edgeslam_torch.eval.benchmark.benchmark import FIGURES, BenchSettings, asked, run_rows, sequences
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.conditions import machine, stamp
-from edgeslam_torch.eval.experiment.figures import Figure, changes, grouped
-from edgeslam_torch.eval.experiment.tables import markdown_table
+from edgeslam_torch.eval.experiment.figures import Figure, changes, grouped, markdown_table
 from edgeslam_torch.files.atomic import write_text
 
 DEFAULT = "default"

@@ -4,6 +4,7 @@ Two medians differ by chance by ``2 sqrt(s_a^2/n_a + s_b^2/n_b)``, with ``s`` th
 seeds, and never by less than a figure's floor, for what one record cannot see of itself.
 """
 
+import textwrap
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.experiment.tables import markdown_table
 from edgeslam_torch.files.record_files import read_mapping
 
 _SIGMAS = 2.0
@@ -165,3 +165,50 @@ def other_conditions(before: Mapping[str, Any], after: Mapping[str, Any]) -> lis
         elif a != b:
             lines.append(f"beware: {key} was {a}, then {b}")
     return lines
+
+
+def text_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Aligned columns, the first to the left, titles above them in as many lines as their words need.
+
+    Example:
+        >>> print(text_table(["run", "ATE [m]"], [["a", "0.0100"], ["other", "0.2"]]))
+                  ATE
+        run       [m]
+        a      0.0100
+        other     0.2
+    """
+    cells = list(zip(*rows, strict=True))
+    widths = [
+        max(max(map(len, words), default=0), *(len(word) for word in ([title] if i == 0 else title.split())))
+        for i, (title, words) in enumerate(zip(titles, cells, strict=True))
+    ]
+    heads = [[title] if i == 0 else textwrap.wrap(title, widths[i]) for i, title in enumerate(titles)]
+    height = max(map(len, heads))
+    above = zip(*([""] * (height - len(head)) + head for head in heads), strict=True)
+    lines = [
+        "  ".join(
+            [line[0].ljust(widths[0]), *(word.rjust(width) for word, width in zip(line[1:], widths[1:], strict=True))]
+        )
+        for line in (*above, *rows)
+    ]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def markdown_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """The same as Markdown, numbers to the right, the first and the last column to the left.
+
+    Example:
+        >>> print(markdown_table(["run", "ATE [m]", "limits"], [["a", "0.0100", "pass"]]))
+        | run | ATE [m] | limits |
+        |-----|--------:|--------|
+        | a   |  0.0100 | pass   |
+    """
+    ends = (0, len(titles) - 1)
+    widths = [max(3, *(len(line[k]) for line in (titles, *rows))) for k in range(len(titles))]
+
+    def text(line: Sequence[str]) -> str:
+        cells = (c.ljust(w) if k in ends else c.rjust(w) for k, (c, w) in enumerate(zip(line, widths, strict=True)))
+        return "| " + " | ".join(cells) + " |"
+
+    rule = "|" + "|".join("-" * (w + 1) + ("-" if k in ends else ":") for k, w in enumerate(widths)) + "|"
+    return "\n".join([text(titles), rule, *map(text, rows)])

@@ -17,7 +17,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.conditions import machine
 from edgeslam_torch.eval.inputs.dataset import find_recordings
 from edgeslam_torch.eval.judge.cells import CASES, Cell, list_cells
-from edgeslam_torch.eval.judge.thresholds import Row
+from edgeslam_torch.eval.judge.table import Row
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.record_files import read_mapping
 

@@ -50,7 +50,8 @@ def run_cell(case: dict[str, Any], folder: Path) -> dict[str, Any]:
     if cell.variant == SECOND_FLIGHT:
         from edgeslam_torch.atlas.atlas_file import read_atlas
 
-        first, first_truth = _first_flight(cell, Path(case["flights"]))
+        first, first_truth = opened(replace(cell, variant=""), folder, Path(case["flights"]))
+        first = replace(first, max_frames=CASES[SECOND_FLIGHT].get(cell.base))
         _flown(first, folder / FIRST, config, AtlasFiles(save=folder / ATLAS))
         earlier = AtlasFiles(load=read_atlas(folder / ATLAS))
     result = _flown(source, folder / RUN, config, earlier)
@@ -59,7 +60,7 @@ def run_cell(case: dict[str, Any], folder: Path) -> dict[str, Any]:
     figures, notes = score(folder / RUN, truth)
     figures |= {"cpu_ms": cpu_ms, "orb_ms": orb_ms, "cpu_orb": cpu_ms / orb_ms}
     if cell.variant == SECOND_FLIGHT:
-        first_scale = score(folder / FIRST, first_truth)[0].get("scale_sim3")
+        first_scale = score(folder / FIRST, Truth(first_truth.poses))[0].get("scale_sim3")
         figures |= _beside_first(result, figures.get("scale_sim3"), first_scale)
     figures["took_s"] = time.monotonic() - begin_s
     return {"figures": figures, "notes": notes}
@@ -126,15 +127,6 @@ def _with_imu(cell: Cell, source: Recording, place: Path) -> Recording:
     dataset = open_dataset(place)
     model, readings = IMU_KINDS[cell.imu](Drawn(dataset.truth, dataset.frame_stamps_s, cell.seed))
     return replace(source, telemetry=[], imu=model, imu_readings=readings)
-
-
-def _first_flight(cell: Cell, flights_root: Path) -> tuple[Recording, Truth]:
-    """Source of the flight whose map the cell's flight starts with."""
-    if cell.course:
-        place = flights.flight_folder(flights_root, cell.course, cell.seed)
-        return _recording(place), Truth(place)
-    source = replace(_recording(Path(cell.folder)), telemetry=[], imu=None, imu_readings=None)
-    return replace(source, max_frames=CASES[SECOND_FLIGHT][cell.base]), Truth(Path(cell.folder))
 
 
 def _recording(place: Path) -> Recording:

@@ -13,10 +13,8 @@ from edgeslam_torch.eval.inputs.associate import match
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, open_run
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
-from edgeslam_torch.eval.metrics import support
 from edgeslam_torch.eval.metrics.align import rms
-from edgeslam_torch.eval.metrics.live_scale import live_figures
-from edgeslam_torch.eval.metrics.revisit import returns
+from edgeslam_torch.eval.metrics.run_figures import at_end, live, live_figures, returns
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore
 from edgeslam_torch.geometry.camera_file import load_camera
@@ -92,11 +90,11 @@ def _own_figures(run: RunFolder) -> dict[str, Any]:
     offered = max(int(summary.get("frames", 0)) + int(summary.get("left_out", 0)), 1)
     counts, scale = summary.get("map") or {}, summary.get("scale") or {}
     sources = str(scale.get("source", "")).split("+")
-    at_end = support.at_end(run.pose_rows, run.trajectory.T_w_c, p_w, load_camera(run.path / "camera.yaml"))
+    supported = at_end(run.pose_rows, run.trajectory.T_w_c, p_w, load_camera(run.path / "camera.yaml"))
     return {
         "frames": summary.get("frames"),
-        "supported_end": np.sum(at_end) / offered,
-        "supported_live": np.sum(support.live(run.status)) / offered,
+        "supported_end": np.sum(supported) / offered,
+        "supported_live": np.sum(live(run.status)) / offered,
         "losses": summary.get("lost_events"),
         "pieces": sum(piece["supported"] > 0 for piece in summary.get("pieces") or ()),
         "metric": float(scale.get("units") == "metres"),

@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, match, possible_pairs
-from edgeslam_torch.eval.inputs.clocks import on_one_clock
+from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, match, on_one_clock, possible_pairs
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
-from edgeslam_torch.eval.metrics.align import AlignmentKind, misfit
-from edgeslam_torch.eval.metrics.clock_offset import best_offset
+from edgeslam_torch.eval.metrics.align import AlignmentKind, best_offset, misfit
 from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore, without_orientation
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.rotations import (

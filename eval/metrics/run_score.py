@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, Association
-from edgeslam_torch.eval.inputs.clocks import on_one_clock
+from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, Association, on_one_clock
 from edgeslam_torch.eval.inputs.dataset import EvalDataset, interpolate, open_dataset
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported, open_run
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.eval.metrics.align import AlignmentKind, umeyama
 from edgeslam_torch.eval.metrics.diagnose import explain
-from edgeslam_torch.eval.metrics.edge_map_score import THRESHOLDS_M, MapScore, score_map
-from edgeslam_torch.eval.metrics.surface import surface_truth
+from edgeslam_torch.eval.metrics.edge_map_score import THRESHOLDS_M, MapScore, score_map, surface_truth
 from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore, score_trajectory, without_orientation
 
 

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgeslam_torch.eval.experiment.figures import Figure
-from edgeslam_torch.eval.experiment.tables import markdown_table, text_table
-from edgeslam_torch.eval.metrics.common_frames import CommonScore
+from edgeslam_torch.eval.experiment.figures import Figure, markdown_table, text_table
 from edgeslam_torch.eval.metrics.depth_error import TITLES, DepthReport
 from edgeslam_torch.eval.metrics.edge_map_score import THRESHOLDS_M
 from edgeslam_torch.eval.metrics.run_score import RunScore
+from edgeslam_torch.eval.metrics.trajectory_error import CommonScore
 
 TRAJECTORY_COLUMNS = (
     Figure("ate_sim3_m", "ATE Sim(3) [m]"),

@@ -19,9 +19,8 @@ from edgeslam_torch.train.signals import Slot
 from edgeslam_torch.train.teachers import teach as teacher
 from edgeslam_torch.train.teachers.teach import log_metres, teach
 from edgeslam_torch.train.validate import metres_by
-from edgeslam_torch.train.views.junctions import junction_points, seen_cosines
+from edgeslam_torch.train.views.edges import junction_points, seen_cosines, straight_edges
 from edgeslam_torch.train.views.posed import is_run_folder, load_run, visible_points
-from edgeslam_torch.train.views.straight import straight_edges
 
 
 @pytest.fixture(scope="module")
@@ -171,9 +170,8 @@ def test_junctions_of_two_views_are_paired_by_place_and_direction():
     assert seen_cosines(turned, found).isnan().all(), "arms the other way"
 
 
-@pytest.mark.parametrize("width", [240, 100], ids=["as they are", "reduced"])
-def test_teacher_measures_what_the_network_does_not_know(sequence, tmp_path, monkeypatch, width):
-    monkeypatch.setattr(teacher, "WIDTH", width)
+def test_teacher_measures_what_the_network_does_not_know(sequence, tmp_path, monkeypatch):
+    monkeypatch.setattr(teacher, "WIDTH", 100)  # of views that are wider
     network = narrow_fastdepth()
     metres = 0.5
     errors, shares = [], []

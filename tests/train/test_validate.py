@@ -7,7 +7,7 @@ from small_depth import METADATA, VIEW, small_depth
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.models.trainable import Prediction
-from edgeslam_torch.train.validate import score
+from edgeslam_torch.train.validate import coverage, score
 from edgeslam_torch.train.views.augment import View
 
 
@@ -26,3 +26,10 @@ def test_depth_out_of_range_does_not_count():
     assert np.isnan(found.abs_rel_edges) and "abs_rel_edges" not in found.metrics()
     with pytest.raises(SourceError, match="no depth between"):
         score(network, METADATA, [View(VIEW.image, np.full_like(depth, 12.0), VIEW.K)])
+
+
+def test_coverage_of_a_normal_sigma_is_nominal(rng):
+    sigma = rng.uniform(0.05, 0.4, 20000)
+    one, two = coverage(rng.normal(0, sigma), sigma)
+    assert one == pytest.approx(0.683, abs=0.02)
+    assert two == pytest.approx(0.95, abs=0.01)

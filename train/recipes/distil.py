@@ -29,11 +29,10 @@ from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.layout import Variant
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
-from edgeslam_torch.train.folder import OutFolder, content
+from edgeslam_torch.train.folder import OutFolder, TrainingResult, content
 from edgeslam_torch.train.hooks import Hooks
 from edgeslam_torch.train.processes.distributed import rank, world
 from edgeslam_torch.train.recipes.finetune import Data, finetune
-from edgeslam_torch.train.result import TrainingResult
 from edgeslam_torch.train.state import TrainConfig
 from edgeslam_torch.train.teachers.teach import at_points, kept_depth, log_metres, teach
 from edgeslam_torch.train.views.datasets import DepthFolder

@@ -19,7 +19,6 @@ from edgeslam_torch.files.plain import subfolder
 from edgeslam_torch.models.checkpoint import restored, save_checkpoint
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
-from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
 from edgeslam_torch.train.callbacks import ProgressBar, curves
 from edgeslam_torch.train.folder import (
     HOOKS,
@@ -27,6 +26,7 @@ from edgeslam_torch.train.folder import (
     TENSORBOARD,
     WEIGHTS,
     OutFolder,
+    TrainingResult,
     content,
     contents,
     inputs,
@@ -35,12 +35,11 @@ from edgeslam_torch.train.folder import (
 from edgeslam_torch.train.hooks import Hooks, changes_losses
 from edgeslam_torch.train.loop import BEST, FINAL, train
 from edgeslam_torch.train.processes.distributed import by_first, rank
-from edgeslam_torch.train.result import TrainingResult
 from edgeslam_torch.train.self_supervised import SelfSupervised
 from edgeslam_torch.train.signals import Signal, Source, Supervised, Views
 from edgeslam_torch.train.state import TrainConfig, TrainState
 from edgeslam_torch.train.teachers.teach import Taught, kept_depth, log_metres, teach
-from edgeslam_torch.train.validate import DepthScores, can_be_scored, metres_by, score
+from edgeslam_torch.train.validate import DepthScores, calibrate_sigma, can_be_scored, metres_by, score
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.posed import PosedSequence

@@ -20,13 +20,12 @@ from edgeslam_torch.models.device import DEVICES
 from edgeslam_torch.models.imagenet import load_imagenet_encoder
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
-from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
 from edgeslam_torch.train.callbacks import ProgressBar
 from edgeslam_torch.train.loop import FINAL, train
 from edgeslam_torch.train.recipes.rendered_views import place_views, render_files, room_views, stored_views
 from edgeslam_torch.train.signals import Source, Supervised, SupervisedWeights
 from edgeslam_torch.train.state import TrainConfig
-from edgeslam_torch.train.validate import score
+from edgeslam_torch.train.validate import calibrate_sigma, score
 from edgeslam_torch.train.views.augment import AugmentConfig, View
 from edgeslam_torch.train.views.datasets import load_depth_folder
 

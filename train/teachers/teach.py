@@ -20,7 +20,6 @@ from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.files.plain import subfolder
 from edgeslam_torch.terminal.progress import counted
 from edgeslam_torch.train.processes.distributed import rank, share_of, wait_for_all
-from edgeslam_torch.train.teachers.densify import densify
 from edgeslam_torch.train.teachers.plane_sweep import sweep_depth
 from edgeslam_torch.train.views.augment import View, fitted_view, scaled_K
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView, relative_motion
@@ -215,3 +214,33 @@ def _small(view: PosedView) -> View:
 
 def _grey(view: View) -> NDArray[np.float32]:
     return cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+
+
+SCALES = (0.15, 0.06, 0.025)
+"""Standard deviations of the spreading, in image widths, coarse to fine."""
+SHRINK = (0.3, 0.5, 1.0)
+"""Prior weight at each scale, in points: finer corrections need more evidence."""
+MAX_LOG_RATIO = 0.5
+"""Points farther than this from the image's median ratio are occluded or wrong."""
+
+
+def densify(log_depth: FloatArray, uv: FloatArray, log_z: FloatArray) -> FloatArray:
+    """Log depth ``(H, W)`` corrected to pass near map points at pixels ``(N, 2)`` with log depths ``(N,)``."""
+    height, width = log_depth.shape
+    v = np.clip(np.rint(uv[:, 1]), 0, height - 1).astype(int)
+    u = np.clip(np.rint(uv[:, 0]), 0, width - 1).astype(int)
+    ratio = log_z - log_depth[v, u]
+    median = float(np.median(ratio))
+    kept = np.abs(ratio - median) < MAX_LOG_RATIO
+    v, u, ratio = v[kept], u[kept], ratio[kept]
+    correction = np.full((height, width), median, np.float32)
+    count = np.zeros((height, width), np.float32)
+    np.add.at(count, (v, u), 1.0)
+    for scale, doubt in zip(SCALES, SHRINK, strict=True):
+        sigma = scale * width
+        rest = np.zeros((height, width), np.float32)
+        np.add.at(rest, (v, u), ratio - correction[v, u])
+        # A point's share in the middle of its own Gaussian is 1 / (2 pi sigma^2): uncertainty in points.
+        weight = cv2.GaussianBlur(count, (0, 0), sigma) + doubt / (2 * np.pi * sigma**2)
+        correction = correction + cv2.GaussianBlur(rest, (0, 0), sigma) / weight
+    return log_depth + correction

@@ -30,8 +30,8 @@ def main(args: argparse.Namespace) -> int:
     """Print the table of differences."""
     from edgeslam_torch.eval.inputs.run_folder import open_run
     from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
-    from edgeslam_torch.eval.metrics.common_frames import score_common
     from edgeslam_torch.eval.metrics.run_score import evaluate_run
+    from edgeslam_torch.eval.metrics.trajectory_error import score_common
     from edgeslam_torch.eval.report.tables import common_report, report_of_two
 
     both = (args.first, args.second)

@@ -14,8 +14,8 @@ from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.output_file import add_overwrite_to, check_new, output_file
 
 if TYPE_CHECKING:
-    from edgeslam_torch.eval.metrics.common_frames import CommonScore
     from edgeslam_torch.eval.metrics.run_score import RunScore
+    from edgeslam_torch.eval.metrics.trajectory_error import CommonScore
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -133,7 +133,7 @@ def _told_apart(scores: "list[RunScore]", runs: list[Path]) -> "list[RunScore]":
 
 def _common(args: argparse.Namespace, scores: "list[RunScore]", judged: list[tuple[Path, Path]]) -> "list[CommonScore]":
     from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
-    from edgeslam_torch.eval.metrics.common_frames import score_common
+    from edgeslam_torch.eval.metrics.trajectory_error import score_common
 
     truth = one_groundtruth([truth for _, truth in judged])
     estimates = [(s.name, read_trajectory(run)) for s, (run, _) in zip(scores, judged, strict=True)]

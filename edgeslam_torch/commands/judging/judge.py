@@ -55,8 +55,7 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.eval.judge.release import command_outputs, release_cells, release_record
     from edgeslam_torch.eval.judge.runner import FORMAT, RECORD, JudgeSettings, judge
     from edgeslam_torch.eval.judge.score import COLUMNS
-    from edgeslam_torch.eval.judge.table import markdown
-    from edgeslam_torch.eval.judge.thresholds import THRESHOLDS, read_thresholds
+    from edgeslam_torch.eval.judge.table import THRESHOLDS, markdown, read_thresholds
     from edgeslam_torch.files.config_file import load_config
 
     load_config(SlamConfig(), None, args.set)  # a setting that does not exist is said before anything is run

@@ -19,10 +19,9 @@ from edgeslam_torch.files.plain import subfolder
 if TYPE_CHECKING:
     from edgeslam_torch.models.record import Metadata
     from edgeslam_torch.models.trainable import DepthModule
-    from edgeslam_torch.train.folder import OutFolder
+    from edgeslam_torch.train.folder import OutFolder, TrainingResult
     from edgeslam_torch.train.hooks import Hooks
     from edgeslam_torch.train.recipes.finetune import FromRuns
-    from edgeslam_torch.train.result import TrainingResult
     from edgeslam_torch.train.state import TrainConfig
     from edgeslam_torch.train.views.datasets import DepthFolder
     from edgeslam_torch.train.views.posed import PosedSequence

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from edgeslam_torch.frontend.depth_network import DepthNetwork
     from edgeslam_torch.models.fastdepth import FastDepth
     from edgeslam_torch.models.record import Metadata
-    from edgeslam_torch.train.folder import OutFolder
+    from edgeslam_torch.train.folder import OutFolder, TrainingResult
     from edgeslam_torch.train.hooks import Hooks
-    from edgeslam_torch.train.result import TrainingResult
     from edgeslam_torch.train.state import TrainConfig
 
 HELP = "distil a larger depth network into a drone-sized one, on recordings without labels"

@@ -23,10 +23,9 @@ from edgeslam_torch.models.record import weights_file
 if TYPE_CHECKING:
     from edgeslam_torch.models.fastdepth import FastDepth
     from edgeslam_torch.models.record import Metadata
-    from edgeslam_torch.train.folder import OutFolder
+    from edgeslam_torch.train.folder import OutFolder, TrainingResult
     from edgeslam_torch.train.hooks import Hooks
     from edgeslam_torch.train.recipes.finetune import Data
-    from edgeslam_torch.train.result import TrainingResult
     from edgeslam_torch.train.state import TrainConfig
 
 logger = logging.getLogger(__name__)

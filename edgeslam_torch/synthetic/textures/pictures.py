@@ -3,8 +3,7 @@
 import cv2
 import numpy as np
 
-from edgeslam_torch.synthetic.textures.materials import TILE_PX, dead_leaves, veneer
-from edgeslam_torch.synthetic.textures.noise import Rng, colour, fractal, shaded
+from edgeslam_torch.synthetic.textures.materials import TILE_PX, Rng, colour, dead_leaves, fractal, shaded, veneer
 from edgeslam_torch.types import FloatArray
 
 WORDS = (

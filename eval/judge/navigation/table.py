@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from edgeslam_torch.eval.experiment.conditions import code_state
+from edgeslam_torch.eval.experiment.figures import markdown_table
 from edgeslam_torch.eval.experiment.runner import Local, Task, run_tasks
-from edgeslam_torch.eval.experiment.tables import markdown_table
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.jobs.watched import Limits

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.clocks import on_one_clock
+from edgeslam_torch.eval.inputs.associate import on_one_clock
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory, write_tum
 
 

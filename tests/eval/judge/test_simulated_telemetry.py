@@ -8,7 +8,7 @@ import pytest
 from edgeslam_torch.eval.inputs.run_folder import RunFolder
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.eval.judge.simulated_telemetry import KINDS, OFF_S, OUTAGE_S, Drawn
-from edgeslam_torch.eval.metrics.live_scale import live_figures
+from edgeslam_torch.eval.metrics.run_figures import live_figures
 from edgeslam_torch.geometry.mount import camera_on_body
 
 SECONDS = 24.0

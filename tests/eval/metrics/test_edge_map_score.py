@@ -9,8 +9,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.eval.metrics.align import Alignment
-from edgeslam_torch.eval.metrics.edge_map_score import score_map
-from edgeslam_torch.eval.metrics.surface import SurfaceTruth, build_surface
+from edgeslam_torch.eval.metrics.edge_map_score import SurfaceTruth, build_surface, score_map
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.layouts.seven_scenes import T_COLOUR_DEPTH

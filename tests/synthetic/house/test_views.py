@@ -6,7 +6,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.house.views import look, random_pose, random_room, random_view
 
-CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+CAMERA = Camera(80, 60, 65.0, 65.0, 39.5, 29.5)
 
 
 def test_pose_looks_along_its_yaw_and_tilt():
@@ -23,11 +23,11 @@ def test_random_rooms_are_closed_sensible_textured_and_the_same_for_a_seed():
         world = random_room(rng)
         pose = random_pose(rng, world)
         assert world.clearance(pose[:3, 3]) > 0
-        views += [render(world, CAMERA, pose), *(random_view(rng, CAMERA, world) for _ in range(2))]
+        views += [render(world, CAMERA, pose), random_view(rng, CAMERA, world)]
     depth = np.stack([v.depth_m for v in views])
     assert np.all(depth > 0.02), "a room has no holes"
     assert 0.9 < np.median(depth) < 4.0 and np.percentile(depth, 99) < 12.0
     assert np.mean([v.image.std() > 8 for v in views]) > 0.8
     rng = np.random.default_rng(6)
     world = random_room(rng)
-    assert render(world, CAMERA, random_pose(rng, world)).image.tobytes() == views[3].image.tobytes()
+    assert render(world, CAMERA, random_pose(rng, world)).image.tobytes() == views[2].image.tobytes()

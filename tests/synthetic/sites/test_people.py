@@ -5,7 +5,7 @@ import pytest
 
 from edgeslam_torch.drone.emulator.drone import DroneModel, Mode
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.synthetic.house.render import render
+from edgeslam_torch.synthetic.house.render import depth_map
 from edgeslam_torch.synthetic.house.views import look
 from edgeslam_torch.synthetic.sites.build import named_site
 from edgeslam_torch.synthetic.sites.people import walker
@@ -41,7 +41,7 @@ def test_people_are_seen_and_felt_where_they_are_now():
     for at_s in (0.0, 3.0):
         (x, y), _ = walkers[0].at(at_s)
         T = look(np.array([x - 2.0, y, 1.1]), 0.0)
-        depth = render(site.painted(at_s), CAMERA, T, antialias=False).depth_m[30, 40]
+        depth = depth_map(site.painted(at_s), CAMERA, T)[30, 40]
         assert 1.5 < depth < 1.95  # half their breadth or depth nearer than their middle
         hit = (np.array([x - 2.0 + depth, y, 1.1]) - site.T_site_w[:3, 3]) @ site.T_site_w[:3, :3]
         assert site.clearance(hit[None], at_s)[0] < 0.02

@@ -3,6 +3,7 @@
 import pytest
 
 from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.synthetic.sites import build
 from edgeslam_torch.synthetic.sites.build import SITES, named_site
 from edgeslam_torch.synthetic.sites.scene_file import FOLDER, read_scene, scene_path
 
@@ -62,7 +63,8 @@ def test_every_scene_of_ours_is_read_and_the_sites_are_among_them():
         ("start", "extends = 'PATH'\nstart", "extends itself"),
     ],
 )
-def test_what_is_wrong_is_named(scene, tmp_path, old, new, words):
+def test_what_is_wrong_is_named(scene, tmp_path, monkeypatch, old, new, words):
+    monkeypatch.setattr(build, "_TRIES", 2)
     assert old in FLAT
     path = scene(FLAT.replace(old, new.replace("PATH", str(tmp_path / "flat.toml")), 1))
     with pytest.raises(ConfigError, match=f"(?s)^[^\n]*{words}[^\n]*$"):

@@ -17,9 +17,9 @@ from edgeslam_torch.models.layout import Variant
 from edgeslam_torch.models.onnx.graph import build_graph
 from edgeslam_torch.models.record import DEFAULT_WEIGHTS
 from edgeslam_torch.synthetic.house.render import render
-from edgeslam_torch.train.calibrate_sigma import coverage, residuals_and_sigma
 from edgeslam_torch.train.recipes.distil import brought_to_map, label, new_student
 from edgeslam_torch.train.teachers import teach
+from edgeslam_torch.train.validate import coverage, residuals_and_sigma
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.posed import load_run
 from edgeslam_torch.types import DepthMap
@@ -66,7 +66,8 @@ def test_teacher_is_brought_to_the_map(sequence, change, relative):
     assert np.median(error(depth / 2.0, view.T_w_c)) < 0.01
 
 
-def test_teacher_that_takes_near_for_far_is_not_believed(sequence, tmp_path):
+def test_teacher_that_takes_near_for_far_is_not_believed(sequence, tmp_path, monkeypatch):
+    monkeypatch.setattr(teach, "MOST", 2)
     wrong = Oracle(sequence, lambda z: 2.0 / z, relative=True)
     assert brought_to_map(wrong, sequence.views[3], 0.0) is None
     with pytest.raises(SourceError, match=r"oracle\.onnx agrees with the map in none"):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from edgeslam_torch.frontend.canny import canny_batch
-from edgeslam_torch.train.views.edge_pixels import edge_pixels
+from edgeslam_torch.train.views.edges import edge_pixels
 
 
 def squares():

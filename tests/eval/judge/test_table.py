@@ -4,8 +4,7 @@ import pytest
 from markdown_rows import row as cells_of
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.judge.table import markdown
-from edgeslam_torch.eval.judge.thresholds import read_thresholds, verdicts
+from edgeslam_torch.eval.judge.table import markdown, read_thresholds, verdicts
 
 
 def row(cell, seed=0, error="", **figures):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.train.teachers.plane_sweep import sweep_depth
+from edgeslam_torch.train.teachers.teach import densify
 
 K = np.array([[100.0, 0.0, 59.5], [0.0, 100.0, 44.5], [0.0, 0.0, 1.0]])
 NORMAL, DISTANCE = np.array([0.3, 0.1, -1.0]), -2.0
@@ -61,3 +62,27 @@ def test_what_one_neighbour_does_not_see_is_taken_from_the_others(rng):
     images[0][:] = texture(np.random.default_rng(9))
     depth = sweep_depth(reference, images, motions, K, INVERSE)
     assert np.mean((np.abs(depth / wall_depth() - 1) < 0.06)[12:78, 15:105]) > 0.85
+
+
+def scene():
+    """Log depth of a tilted wall, and a network's view of it: 30 % too far on the left, right on the right."""
+    true = np.log(np.linspace(1.5, 3.0, 160, dtype=np.float32))[None].repeat(120, 0)
+    wrong = true + np.linspace(0.3, 0.0, 160, dtype=np.float32)[None]
+    return true, wrong
+
+
+def test_points_correct_the_network_smoothly(rng):
+    true, wrong = scene()
+    uv = np.stack([rng.uniform(0, 159, 600), rng.uniform(0, 119, 600)], 1)
+    log_z = true[np.rint(uv[:, 1]).astype(int), np.rint(uv[:, 0]).astype(int)]
+    out = densify(wrong, uv, log_z)
+    assert np.abs(out - true).mean() < 0.2 * np.abs(wrong - true).mean()
+    assert np.abs(np.diff(out - wrong, axis=1)).max() < 0.02, "no steps at the points"
+
+
+def test_one_outlier_changes_little(rng):
+    true, _ = scene()
+    uv = np.stack([rng.uniform(0, 159, 300), rng.uniform(0, 119, 300)], 1)
+    log_z = true[np.rint(uv[:, 1]).astype(int), np.rint(uv[:, 0]).astype(int)].copy()
+    log_z[7] += 1.5
+    assert np.abs(densify(true, uv, log_z) - true).max() < 0.02
