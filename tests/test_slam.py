@@ -139,20 +139,6 @@ def test_unusable_depth_is_as_no_depth():
     assert a.warnings() == []
 
 
-def test_depth_that_fails_now_and_then_costs_those_keyframes_only():
-    known, calls = panels().depth_function(), iter(range(1000))
-
-    def depth(image, camera):
-        good = known(image, camera)
-        return good if next(calls) % 2 == 0 else DepthMap(np.full_like(good.depth_m, np.nan), good.sigma_log)
-
-    slam, outputs = go(panels().frames, depth)
-    assert ate(slam.trajectory()[1], panels().T_w_c, "se3") < 0.04
-    assert slam.scale.units is Units.METRES
-    assert set(statuses(outputs)) <= TRACKING
-    assert slam.depth.refused > 0
-
-
 def in_the_world(slam, p_w):
     """Points of a map in the world of the images, the path's scale taken from it: and rotations, as it is straight."""
     T_w_c, truth = slam.trajectory()[1], panels().T_w_c
@@ -286,29 +272,6 @@ def test_without_two_frames_there_is_an_empty_map(count):
     assert slam.trajectory()[1].shape == (count, 4, 4)
     assert not slam.support().supported.any()
     assert {len(points) for points in (slam.edge_map().p_w, slam.anchors().p_w, *slam.surroundings())} == {0}
-
-
-@pytest.mark.parametrize("depth", [True, False])
-def test_standing_still_stays_put(depth):
-    first = panels().frames[0]
-    frames = [replace(first, index=i, stamp_s=0.1 * i) for i in range(12)]
-    _, outputs = go(frames, panels().depth_function() if depth else None)
-    assert {o.reason for o in outputs[1:]} == {"initialising: no motion"}
-    T = np.stack([o.T_w_c for o in outputs])
-    assert np.abs(T[:, :3, 3]).max() < 1e-3
-
-
-def test_turning_on_the_spot_is_no_initialisation():
-    """Rotation is known from the first frame; no translation is made up and no two-view map accepted."""
-    poses = sideways(10, 0.0, turn_rad=0.015)
-    turning = film(stairs_world(), CAMERA, poses)
-    slam, outputs = go(turning.frames)
-    assert all(o.reason in ("initialising: pure rotation", "initialising: no motion") for o in outputs[1:])
-    assert not slam.support().supported.any()
-    last = se3.log(se3.inverse(outputs[0].T_w_c) @ outputs[-1].T_w_c)
-    assert np.linalg.norm(last[3:] - [0.0, 0.135, 0.0]) < 0.01
-    assert np.linalg.norm(last[:3]) < 0.03  # of guessed units, everything a unit away
-    assert len(slam.anchors().p_w) == 0
 
 
 def test_turning_on_the_spot_with_a_network_keeps_one_map():
@@ -474,16 +437,6 @@ def test_a_frozen_video_says_so_and_shows_no_motion():
     assert not any("repeats" in o.reason for o in outputs[:24])
     assert slam.pose_now(frozen[-1].stamp_s).seen_s == frames[-1].stamp_s, "what is repeated was seen before"
     assert any("froze" in w for w in slam.warnings())
-
-
-@pytest.mark.parametrize(("speed_m_s", "accused"), [(0.0, False), (0.4, True)])
-def test_a_hover_is_no_video_that_stood_still(speed_m_s, accused):
-    frames = [replace(panels().frames[0], index=k, stamp_s=1.0 + k / 15) for k in range(45)]
-    slam = EdgeSlam(CAMERA, NO_NETWORK)
-    for frame in frames:
-        told = TelemetrySample(frame.stamp_s, np.array([speed_m_s, 0.0, 0.0]), np.array([0.0, 0.0, 0.3]))
-        slam.step(frame, [told])
-    assert any("froze" in w for w in slam.warnings()) == accused
 
 
 def test_telemetry_that_the_images_do_not_bear_out_is_a_warning_of_the_system():

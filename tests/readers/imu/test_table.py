@@ -67,15 +67,10 @@ def test_what_is_doubtful_is_said_in_one_line(tmp_path, columns, words):
 
 @pytest.mark.parametrize(
     ("columns", "words"),
-    [
-        ((STAMPS_S, RATE * 300, FORCE), "degrees"),
-        ((STAMPS_S, RATE, FORCE - [0, 0, 9.81]), "gravity"),
-        ((STAMPS_S * 0 + 5.0, RATE, FORCE), "fewer than two"),
-        ((STAMPS_S, RATE[:, :1]), "gyro"),
-        ((STAMPS_S, RATE, FORCE, FORCE), "header"),
-        ((STAMPS_S * 1e-9, RATE, FORCE), "unit"),
-    ],
-)
+    [((STAMPS_S, RATE * 300, FORCE), "degrees"), ((STAMPS_S, RATE, FORCE - [0, 0, 9.81]), "gravity"),
+     ((STAMPS_S * 0 + 5.0, RATE, FORCE), "fewer than two"), ((STAMPS_S, RATE[:, :1]), "gyro"),
+     ((STAMPS_S, RATE, FORCE, FORCE), "header"), ((STAMPS_S * 1e-9, RATE, FORCE), "unit")],
+)  # fmt: skip
 def test_what_is_no_imu_is_refused(tmp_path, columns, words):
     with pytest.raises(SourceError, match=words):
         read_readings(written(tmp_path / "imu.csv", "", *columns))
