@@ -91,6 +91,8 @@ VISUAL_DRIFT_TURN = 0.003
 """The same as a share of the angle turned."""
 VISUAL_JITTER_M, VISUAL_JITTER_RAD = 0.002, 0.001
 """Least noise of a tracked pose."""
+TRACKED_M, TRACKED_RAD = 0.03, math.radians(0.8)
+"""Of a tracked pose beside the filter's prediction: what ten readings a second do not show of a jerk."""
 MAP_DRIFT_M, MAP_DRIFT_MEMORY_S = (0.03, 0.002), 4.0
 """Of the map's local distortion, default first, of which the residuals choose: the error of a position against those
 seconds before, and its correlation time."""

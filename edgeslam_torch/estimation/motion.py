@@ -14,8 +14,6 @@ from dataclasses import replace
 import numpy as np
 
 from edgeslam_torch.estimation.config import INTERVAL_S, MAX_GAP_S, WINDOW_S, FusionConfig
-from edgeslam_torch.estimation.dead_reckoning import REACH_S as RECKONED_S
-from edgeslam_torch.estimation.dead_reckoning import Reckoned, reckoned
 from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.estimation.filter.filter_feed import FilterFeed, PoseEstimate
 from edgeslam_torch.estimation.orientation import Orientation
@@ -78,8 +76,8 @@ class MotionFusion:
         self._filter = FilterFeed(config, given)
         self._drift: str | None = None
         """Warning that parts of the map have different scales."""
-        self._fitted_s = self._remembered_s = -math.inf
-        """Stamps of the last fit, and of the last update of the stored poses to the present map."""
+        self._fitted_s = -math.inf
+        """Stamp of the last fit."""
         self._counts: Counter[str] = Counter()
 
     # --- input ---------------------------------------------------------------------------------------------------
@@ -120,8 +118,6 @@ class MotionFusion:
         if self._is_due(stamp_s) or (stamp_s - self._fitted_s >= _FIRST_FIT_S and self.orientation.has_diverged()):
             self._remember_refined(stamp_s, WINDOW_S)
             self._refit()
-        elif self.metres.sensor_scale is not None and stamp_s - self._remembered_s >= _REFIT_S:
-            self._remember_refined(stamp_s, RECKONED_S)
         if self.imu.is_due(stamp_s):
             self._remember_refined(stamp_s, IMU_REACH_S)
             self._fit_imu()
@@ -164,7 +160,6 @@ class MotionFusion:
     def _remember_refined(self, stamp_s: float, reach_s: float) -> None:
         """Update the poses of the last seconds to the present map."""
         if self.refined_poses is not None:
-            self._remembered_s = stamp_s
             self._remember(*self.refined_poses(stamp_s - reach_s))
 
     def _remember(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
@@ -222,21 +217,6 @@ class MotionFusion:
         degrees is worse than a map with parallax."""
         usable = self.metres.sensor_scale is None and self.orientation.began_upright
         return self.orientation.vertical(stamp_s) if usable else None
-
-    def attitude_and_position(self, stamp_s: float) -> tuple[tuple[FloatArray, float] | None, Reckoned | None]:
-        """Results of `Orientation.turned` and `reckoned` for a frame."""
-        return self.orientation.turned(stamp_s), self.reckoned(stamp_s)
-
-    def reckoned(self, stamp_s: float) -> Reckoned | None:
-        """Position of a frame's camera by dead reckoning; None without validated velocities or without a metric scale
-        that rests on them: heights alone may give a scale that is wrong by several times."""
-        scale = self.metres.sensor_scale
-        if scale is None or "telemetry" not in scale.source:
-            return None
-        model, recent = self._model(), self._memory.recent(stamp_s - RECKONED_S)
-        if model is None or recent is None or not (model.velocity and math.isfinite(model.delay_sigma_s)):
-            return None
-        return reckoned(model, recent, stamp_s)
 
     @property
     def filtering(self) -> bool:

@@ -7,14 +7,12 @@ import numpy as np
 from edgeslam_torch.estimation.remembered import Remembered
 from edgeslam_torch.estimation.scale.camera_mount import Turned, mount_by_turns
 from edgeslam_torch.estimation.sensors.attitude import is_steady
-from edgeslam_torch.estimation.telemetry.alignment import LATELY, attitudes, map_to_world
+from edgeslam_torch.estimation.telemetry.alignment import LATELY, attitudes
 from edgeslam_torch.estimation.telemetry.comparison import MAX_DEVIATION_RAD
 from edgeslam_torch.geometry.rotations import rotation_vector
-from edgeslam_torch.noise import DELAY_S, MOUNT_RAD, STAMP_S
+from edgeslam_torch.noise import DELAY_S, MOUNT_RAD
 from edgeslam_torch.types import FloatArray
 
-_TURNED_S = 5.0
-"""Time over which map and attitude are aligned; maps drift by a degree in it."""
 _AT_ONCE_S = 0.5
 """Time after the first frame in which the first attitude must arrive to level the map: five messages."""
 
@@ -93,26 +91,6 @@ class Orientation:
             return None
         leaned = flight.track.leaned(at_s, min(flight.delay_sigma_s, DELAY_S))
         return self.given[:3, :3].T @ flight.track.attitude(at_s)[0, 2], float(leaned[0])
-
-    def turned(self, stamp_s: float) -> tuple[FloatArray, float] | None:
-        """Rotation ``R_c_m`` ``(3, 3)`` of a frame's camera by the drone's attitude, aligned with the map over the last
-        seconds, and its maximum error [rad] due to the uncertain delay; None without validated telemetry or enough
-        frames."""
-        flight = self._flight
-        late_s = math.hypot(flight.delay_sigma_s, STAMP_S)
-        around = stamp_s - flight.delay_s + np.array([0.0, -late_s, late_s])
-        if not (flight.trust.turns and math.isfinite(late_s) and flight.track.covered(around[:1], around[:1])[0]):
-            return None
-        recent = flight.memory.recent(stamp_s - _TURNED_S)
-        if recent is None:
-            return None
-        R_b_c = self.T_b_c[:3, :3]
-        R_w_m = map_to_world(recent, flight.track, flight.delay_s, R_b_c)
-        if R_w_m is None:
-            return None
-        R_m_c = R_w_m.T @ flight.track.attitude(around) @ R_b_c
-        doubt = max(float(np.linalg.norm(rotation_vector(R_m_c[0].T @ R_m_c[k]))) for k in (1, 2))
-        return R_m_c[0].T, doubt
 
     def upright(self) -> FloatArray | None:
         """``R_w_m`` if attitude may level the world: when it was validated, or arrived with the first frame."""

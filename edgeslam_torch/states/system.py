@@ -21,7 +21,7 @@ from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
 from edgeslam_torch.stage_times import timed
 from edgeslam_torch.tracking.motion_model import MotionModel
-from edgeslam_torch.tracking.pose_prior import Attitude, Place, SensorPrior, TrackingPrior, Vertical
+from edgeslam_torch.tracking.pose_prior import TrackingPrior, Vertical
 from edgeslam_torch.tracking.relocaliser import Reach, reach_after
 from edgeslam_torch.tracking.tracker import Track, Tracker
 from edgeslam_torch.types import FloatArray, Frame, TelemetrySample
@@ -76,8 +76,6 @@ class System:
     its result, since a view that leaves the map faster than this grows is lost."""
     shows_nothing_new: bool = False
     """Whether the current image repeats the previous one."""
-    _sensor_prior: tuple[float, SensorPrior | None] = field(default=(-np.inf, None), init=False, repr=False)
-    """Sensor prior of one frame by its stamp; it is used several times."""
     stage_ms: dict[str, float] = field(default_factory=dict)
     """Times of the current frame."""
 
@@ -124,21 +122,7 @@ class System:
         up = self.fusion.vertical(stamp_s) if self._is_new(stamp_s) else None
         vertical = None if up is None else Vertical(*up)
         by_motion = self.motion.pose_prior(stamp_s, T_predicted, self.published.scale)
-        sensors = self.sensor_prior(stamp_s)
-        return TrackingPrior(by_motion, vertical, None if sensors is None else sensors.place)
-
-    def sensor_prior(self, stamp_s: float) -> SensorPrior | None:
-        """Prior on a frame's pose by the drone's sensors; None without validated ones."""
-        if self._sensor_prior[0] != stamp_s:
-            self._sensor_prior = stamp_s, self._make_sensor_prior(stamp_s) if self.has_telemetry else None
-        return self._sensor_prior[1]
-
-    def _make_sensor_prior(self, stamp_s: float) -> SensorPrior | None:
-        turned, reckoned = self.fusion.attitude_and_position(stamp_s)
-        if turned is None and reckoned is None:
-            return None
-        place = None if reckoned is None else Place(reckoned.R_w_m, reckoned.centre, reckoned.doubt)
-        return SensorPrior(None if turned is None else Attitude(*turned), place)
+        return TrackingPrior(by_motion, vertical)
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""

@@ -6,9 +6,11 @@ import numpy as np
 
 from edgeslam_torch.atlas.place_recognition import revisit_candidates
 from edgeslam_torch.atlas.saved import BEFORE_S
+from edgeslam_torch.atlas.submap_graph import Belief
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe, tracked_motion
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
+from edgeslam_torch.noise import TRACKED_M, TRACKED_RAD
 from edgeslam_torch.states.machine import Event
 from edgeslam_torch.states.retroactive_localisation import MAX_FRAMES, Frames, place_lost_frames
 from edgeslam_torch.states.step import Located, Step
@@ -75,7 +77,7 @@ class Tracking:
         with self.system.map.lock:
             located = self._locate(frame, seen, T_predicted)
             if located is not None:
-                located = self._check_with_sensors(frame, seen, T_predicted, located)
+                located = self._check_with_sensors(frame, seen, located)
             return None if located is None else self.arrive(frame, seen, T_predicted, located)
 
     def _locate(self, frame: Frame, seen: LazyView, T_predicted: FloatArray) -> Located | None:
@@ -96,17 +98,17 @@ class Tracking:
             located = matched
         return self._by_edges(frame, seen, T_predicted) if located is None else located
 
-    def _check_with_sensors(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Located:
+    def _check_with_sensors(self, frame: Frame, seen: LazyView, located: Located) -> Located:
         """Repeat the search from the sensors' prediction if the drone's sensors contradict a pose.
 
         On a repetitive pattern, such as wallpaper, matching may lock on the neighbouring repetition. If the second
         search gives the same pose it is kept: telemetry alone moves no pose.
         """
-        sensors, template = self.system.sensor_prior(frame.stamp_s), self._template
-        if sensors is None or not sensors.is_outlier(located.track.T_c_w):
+        predicted, template = self._predicted_by_sensors(frame.stamp_s), self._template
+        if predicted is None or predicted[1].allows_pose(predicted[0], located.track.T_c_w):
             return located
-        again = self._locate(frame, seen, sensors.applied_to(T_predicted))
-        if again is None or sensors.is_outlier(again.track.T_c_w):
+        again = self._locate(frame, seen, predicted[0])
+        if again is None or not predicted[1].allows_pose(predicted[0], again.track.T_c_w):
             self._template = template
             self.system.events["contradicted"] += 1
             return replace(located, contradicted=True)
@@ -298,8 +300,17 @@ class Tracking:
 
     def _contradicts_sensors(self, T_c_w: FloatArray, stamp_s: float) -> bool:
         """Whether the sensors contradict a pose ``(4, 4)`` by edges; parallel edges constrain few directions."""
-        sensors = self.system.sensor_prior(stamp_s)
-        return sensors is not None and sensors.is_outlier(T_c_w)
+        predicted = self._predicted_by_sensors(stamp_s)
+        return predicted is not None and not predicted[1].allows_pose(predicted[0], T_c_w)
+
+    def _predicted_by_sensors(self, stamp_s: float) -> tuple[FloatArray, Belief] | None:
+        """``T_c_w`` ``(4, 4)`` by the Kalman filter and how far a tracked pose may be from it; None without validated
+        sensors."""
+        predicted = self.system.fusion.predict(stamp_s)
+        if predicted is None:
+            return None
+        belief = Belief(TRACKED_M / self.system.fusion.scale().value, TRACKED_RAD)
+        return se3.inverse(predicted.T_w_c), belief.plus(predicted.sigma_t, predicted.sigma_r_rad)
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Poses that the drone's attitude or position contradicts: on a repetitive wall, corners match the neighbouring
+"""Poses that the filter's prediction contradicts: on a repetitive wall, corners match the neighbouring
 repetition. (Corners on whole pixels; with sub-pixel alignment such mismatches are rare.)"""
 
 from functools import lru_cache
@@ -8,7 +8,7 @@ import pytest
 from rendered import CAMERA, film, panels, patchwork
 
 from edgeslam_torch.config import DepthConfig, MappingConfig, SlamConfig
-from edgeslam_torch.estimation.dead_reckoning import Reckoned
+from edgeslam_torch.estimation.filter.filter_feed import PoseEstimate
 from edgeslam_torch.estimation.output_frame import T_LEVEL
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
@@ -19,7 +19,6 @@ PERIOD_M = 0.24
 STEPS_M = (0.15, 0.18)
 """Distance from one frame to the next, for three of them: 20 and 23 px."""
 PICTURE_M = 0.6
-DOUBT_M = 0.08
 STEP_RAD = 0.09
 """Rotation from one frame to the next, for three of them: 23 px. When it ends, the neighbouring repetition is nearer to
 the prediction."""
@@ -62,66 +61,49 @@ def passing(axis):
     return papered(after_eleven(step), PICTURE_M)
 
 
-def flown(flight, told=lambda stamp_s: None, place=lambda stamp_s: None):
-    """Outputs of a flight with the given attitude and position measurements."""
+def flown(flight, predicted=lambda stamp_s: None):
+    """Outputs of a flight with a filter that predicts these poses."""
     config = SlamConfig(depth=DepthConfig(weights="none"), mapping=MappingConfig(sub_pixel=False))
     slam = EdgeSlam(CAMERA, config, depth=flight.depth_function())
-    slam._system.has_telemetry, slam._system.fusion.orientation.turned, slam._system.fusion.reckoned = True, told, place
+    slam._system.fusion.predict = predicted
     return [slam.step(frame) for frame in flight.frames]
 
 
-def turned_wrongly_deg(told):
-    """Rotation error of the last pose in front of the wallpaper."""
-    flight = wallpaper()
-    R_w_c = np.stack([out.T_w_c[:3, :3] for out in flown(flight, told)])
-    relative = (R_w_c[0].T @ R_w_c[-1]).T @ flight.T_w_c[0, :3, :3].T @ flight.T_w_c[-1, :3, :3]
-    return np.degrees(np.arccos(np.clip((np.trace(relative) - 1.0) / 2.0, -1.0, 1.0)))
+def true_pose(flight):
+    """A filter that predicts the true pose of each frame, in a map levelled to the first camera."""
 
-
-def true_turn(stamp_s):
-    """True attitude, in a map levelled to the first camera."""
-    flight = wallpaper()
-    k = int(np.argmin(np.abs(flight.stamps_s - stamp_s)))
-    return (T_LEVEL[:3, :3] @ flight.T_w_c[0, :3, :3].T @ flight.T_w_c[k, :3, :3]).T, 0.0
-
-
-def test_attitude_prevents_a_mismatch_on_a_repetitive_wall():
-    assert turned_wrongly_deg(true_turn) < 2.0
-    assert turned_wrongly_deg(lambda stamp_s: None) > 5.0
-
-
-def true_centre(flight, k):
-    """True camera centre of a frame in a map levelled to the first camera."""
-    return (T_LEVEL @ se3.inverse(flight.T_w_c[0]) @ flight.T_w_c[k])[:3, 3]
-
-
-def sensor_prediction(flight):
-    """Dead-reckoned position of a frame's camera."""
-
-    def place(stamp_s):
+    def predict(stamp_s):
         k = int(np.argmin(np.abs(flight.stamps_s - stamp_s)))
-        return Reckoned(np.eye(3), true_centre(flight, k), np.full(3, DOUBT_M))
+        return PoseEstimate(T_LEVEL @ se3.inverse(flight.T_w_c[0]) @ flight.T_w_c[k], 0.01, 0.005)
 
-    return place
+    return predict
+
+
+def errors(flight, outputs):
+    """Error of the last pose: of its rotation [deg], and of its centre [m]."""
+    off = se3.inverse(true_pose(flight)(flight.stamps_s[-1]).T_w_c) @ outputs[-1].T_w_c
+    return np.degrees(np.linalg.norm(se3.log(off)[3:])), float(np.linalg.norm(off[:3, 3]))
+
+
+def test_a_predicted_rotation_prevents_a_mismatch_on_a_repetitive_wall():
+    flight = wallpaper()
+    assert errors(flight, flown(flight, true_pose(flight)))[0] < 2.0
+    assert errors(flight, flown(flight))[0] > 5.0
 
 
 @pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_position_prevents_a_mismatch_on_a_repetitive_wall(axis):
+def test_a_predicted_position_prevents_a_mismatch_on_a_repetitive_wall(axis):
     flight = passing(axis)
-    held, alone = (flown(flight, place=place) for place in (sensor_prediction(flight), lambda stamp_s: None))
-    true = true_centre(flight, len(flight.frames) - 1)
-    assert np.abs(held[-1].T_w_c[:3, 3] - true).max() < 1.5 * DOUBT_M
-    assert np.abs(alone[-1].T_w_c[:3, 3] - true).max() > 4.0 * DOUBT_M
+    assert errors(flight, flown(flight, true_pose(flight)))[1] < 0.1
+    assert errors(flight, flown(flight))[1] > 0.3
 
 
 def test_wrong_sensors_do_not_change_a_pose_that_images_confirm():
     flight = panels().first(16)
-    turn = se3.exp(np.array([0.0, 0.0, 0.0, 0.1, 0.1, 0.1]))[:3, :3]
-    place = Reckoned(np.eye(3), np.array([0.3, -0.5, 0.4]), np.full(3, DOUBT_M))
-    untold = flown(flight)
+    lie = PoseEstimate(se3.exp(np.array([0.3, -0.5, 0.4, 0.1, 0.1, 0.1])), 0.01, 0.005)
+    lied, untold = flown(flight, lambda stamp_s: lie), flown(flight)
     assert not untold[-1].reason
-    for lied in (flown(flight, told=lambda stamp_s: (turn, 0.0)), flown(flight, place=lambda stamp_s: place)):
-        assert [out.status for out in lied] == [out.status for out in untold]
-        for a, b in zip(lied, untold, strict=True):
-            np.testing.assert_allclose(a.T_w_c, b.T_w_c, atol=2e-3)
-        assert "contradicted" in lied[-1].reason
+    assert [out.status for out in lied] == [out.status for out in untold]
+    for a, b in zip(lied, untold, strict=True):
+        np.testing.assert_allclose(a.T_w_c, b.T_w_c, atol=2e-3)
+    assert "contradicted" in lied[-1].reason

@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from itertools import islice, takewhile
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,6 @@ from edgeslam_torch.types import FloatArray
 
 _SIGHTING_S = 0.09
 """Minimum time between stored poses: telemetry comes every 0.1 s."""
-_FEW = 4
-"""Minimum number of recent poses for a mean: a second of flight."""
 _MANY_DISPLACEMENTS = 16
 """Number of displacements from which on pairs are merged to intervals of a second."""
 
@@ -185,12 +183,6 @@ class VisualMemory:
             R = seen.T[:, :3, :3]
             self._displacements = Displacements(seen.stamps_s[i], seen.stamps_s[j], moved, sigma, R[i], R[j])
         return self._displacements
-
-    def recent(self, since_s: float) -> Sightings | None:
-        """Every third pose since a stamp, as arrays; None with too few for a mean."""
-        newest_first = takewhile(lambda v: v.stamp_s >= since_s, reversed(self._sightings))
-        some = list(islice(newest_first, 0, None, 3))
-        return _arrays(some) if len(some) >= _FEW else None
 
     def newest(self, count: int) -> Sightings:
         """At most ``count`` newest poses in order, as arrays."""
