@@ -11,6 +11,7 @@ Note:
 """
 
 import math
+from copy import copy
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -23,7 +24,6 @@ from edgeslam_torch.geometry.rotations import (
     matrix_from_rpy,
     rotation_vector,
     rpy_from_matrix,
-    wrapped,
 )
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.noise import (
@@ -47,9 +47,6 @@ RECOVERS_AFTER = 5
 """Refusals in a row after which the covariance is inflated and the measurement taken."""
 _BLIND_S = 0.5
 """Time without vision after which zero readings are taken as hover; longer than a late video's gap."""
-
-Saved = tuple[FloatArray, FloatArray, float, dict[int, int]]
-"""State, covariance, time since vision, refusals in a row."""
 
 
 class Outcome(StrEnum):
@@ -76,11 +73,6 @@ class EkfState:
     covariance: FloatArray
     """``(6, 6)`` of position [m] and angles [rad]."""
 
-    def nees(self, p_w: FloatArray, rpy_rad: FloatArray) -> float:
-        """Normalised estimation error squared against the truth; chi-square with 6 degrees when consistent."""
-        error = np.concatenate([self.p_w - p_w, wrapped(self.rpy_rad - rpy_rad)])
-        return float(error @ np.linalg.solve(self.covariance, error))
-
 
 @dataclass(frozen=True, slots=True)
 class Relative:
@@ -95,7 +87,7 @@ class Relative:
 
 
 class Ekf:
-    """The filter without clock and buffer; see `BufferedEkf` for late measurements."""
+    """The filter at one moment, with the readings that are valid there; `BufferedEkf` takes late measurements."""
 
     def __init__(self, config: FusionConfig) -> None:
         self.config = config
@@ -108,8 +100,21 @@ class Ekf:
         """Time since the last visual update, paper eq. (10)."""
         self.refused_in_row = {3: 0, 6: 0}
         """Consecutive refusals of attitude (3 components) and of vision (6)."""
-        self.nis = math.nan
-        """Normalised innovation squared of the last measurement."""
+        self.velocity: FloatArray = np.zeros(3)
+        self.battery = math.nan
+        """Of the newest reading; the velocity is interpolated between two."""
+        self.rpy_rad: FloatArray = np.full(3, math.nan)
+        self.rpy_rate: FloatArray = np.zeros(3)
+        self.rpy_s = math.nan
+        """Attitude reading, its rate against the one before [rad/s], and its stamp."""
+        self.clone_s = math.nan
+        """Stamp of the clone."""
+
+    def copy(self) -> "Ekf":
+        """An independent copy."""
+        other = copy(self)
+        other.x, other.P, other.refused_in_row = self.x.copy(), self.P.copy(), dict(self.refused_in_row)
+        return other
 
     def reset_pose(self, p_w: FloatArray, rpy_rad: FloatArray) -> None:
         """Start at a given pose with the initial uncertainty."""
@@ -130,9 +135,6 @@ class Ekf:
         """
         self.tau_s += dt_s
         spent = 1.0 - battery if battery == battery else 0.0
-        if self.config.literal:
-            self._predict_literal(dt_s, velocity_m_s, spent)
-            return
         config, x, P = self.config, self.x, self.P
         velocity = velocity_m_s - self._bias(velocity_m_s)
         if config.velocity_frame == "body":
@@ -148,13 +150,16 @@ class Ekf:
             P[_P] -= dt_s * P[_B]
             P[:, _P] -= dt_s * P[:, _B]
         x[_P] += dt_s * moved
+        diagonal = P.ravel()[:: _SIZE + 1]
+        if config.literal:
+            diagonal[_POSE] += config.literal_beta * (spent + config.lambda_tau * self.tau_s)
+            return
         growth = 1.0 + config.beta * spent + config.lambda_tau * min(self.tau_s, 60.0)
         position = dt_s * (0.1 * VELOCITY_M_S**2 * growth + POSITION_FLOOR_M_SQRT_S**2)
         x[_A] += dt_s * rpy_rate_rad_s
         turning = dt_s * ATTITUDE_WALK_RAD_SQRT_S**2
         bias = dt_s * VELOCITY_BIAS_WALK_M_S_SQRT_S**2 * growth if config.sigma_bias_m_s > 0 else 0.0
         # A reading's error lasts as long as the reading, 0.1 s: dt * 0.1 s of variance, not dt^2.
-        diagonal = P.ravel()[:: _SIZE + 1]
         diagonal[_P] += position
         diagonal[_A] += turning
         diagonal[_B] += bias
@@ -168,27 +173,13 @@ class Ekf:
         bias = self.x[_B]
         return bias if self.tau_s < _BLIND_S else np.where(velocity_m_s == 0.0, 0.0, bias)
 
-    def _predict_literal(self, dt_s: float, velocity_m_s: FloatArray, spent: float) -> None:
-        x, P, config = self.x, self.P, self.config
-        moved = velocity_m_s
-        if config.velocity_frame == "body":
-            R = matrix_from_rpy(x[_A])
-            moved = R @ velocity_m_s
-            A = dt_s * _cross_columns(euler_rate_matrix(x[_A]), moved)
-            P[_P] += A @ P[_A]
-            P[:, _P] += P[:, _A] @ A.T
-        x[_P] += dt_s * moved
-        noise = config.literal_beta * (spent + config.lambda_tau * self.tau_s)
-        P.ravel()[:: _SIZE + 1][_POSE] += noise
-
-    def update_attitude(self, rpy_rad: FloatArray, sigma_rad: float | None = None) -> Outcome:
+    def update_attitude(self, rpy_rad: FloatArray) -> Outcome:
         """Euler angles from the drone, paper eqs. (11)-(12)."""
-        sigma = ATTITUDE_RAD if sigma_rad is None else sigma_rad
         residual = rpy_rad - self.x[_A]
         if not self.config.literal:
             _wrap_in_place(residual, (0, 1, 2))
         P_Ht = self.P[:, _A]
-        return self._update(P_Ht, P_Ht[_A].copy(), residual, np.full(3, sigma**2))
+        return self._update(P_Ht, P_Ht[_A].copy(), residual, np.full(3, ATTITUDE_RAD**2))
 
     def update_absolute(self, p_w: FloatArray, rpy_rad: FloatArray, sigma_t_m: float, sigma_r_rad: float) -> Outcome:
         """Accumulated visual pose as a full-state measurement, paper eqs. (13)-(14)."""
@@ -244,12 +235,8 @@ class Ekf:
         self._after_visual(outcome)
         return outcome
 
-    def since_clone(self, velocity_m_s: FloatArray) -> "Relative":
-        """Pose and velocity in the body axes of the last visual update.
-
-        Args:
-            velocity_m_s: Current reading ``(3,)``, in ``config.velocity_frame``.
-        """
+    def since_clone(self) -> "Relative":
+        """Pose and velocity in the body axes of the last visual update."""
         x, config = self.x, self.config
         seen, H = _relative(x, np.eye(4))
         R_c = matrix_from_rpy(x[_CLONE_A])
@@ -258,7 +245,7 @@ class Ekf:
         T[:3, 3] = -seen[:3]
         bias = np.zeros(3) if config.literal else x[_B]
         turned = matrix_from_rpy(x[_A]) if config.velocity_frame == "body" else np.eye(3)
-        velocity_w = turned @ (velocity_m_s - bias)
+        velocity_w = turned @ (self.velocity - bias)
         J = np.zeros((9, _SIZE))
         J[:6] = H
         J[6:, _B] = -R_c.T @ turned
@@ -278,16 +265,16 @@ class Ekf:
             return Outcome.NOT_FINITE
         S.ravel()[:: n + 1] += noise
         gain, weighted = _solved(S, P_Ht, residual)
-        self.nis = float(residual.dot(weighted))
+        distance = float(residual.dot(weighted))
         outcome = Outcome.ACCEPTED
-        if not self.config.literal and exceedance(self.nis, n) < _UNLIKELY:
+        if not self.config.literal and exceedance(distance, n) < _UNLIKELY:
             self.refused_in_row[n] += 1
             if self.refused_in_row[n] < RECOVERS_AFTER:
                 return Outcome.REFUSED
             outcome = Outcome.RECOVERED
             # The filter was overconfident: inflate the observed subspace according to the innovation. Inflating all of
             # the covariance would let it grow without bound, as the absolute position is unobservable.
-            grown = min(self.nis / n, 1e4) - 1.0
+            grown = min(distance / n, 1e4) - 1.0
             known = S.copy()
             known.ravel()[:: n + 1] -= noise
             along = np.eye(n) + grown * np.linalg.solve(S, known)
@@ -310,15 +297,6 @@ class Ekf:
         """Snapshot of the pose and its covariance."""
         x = self.x
         return EkfState(stamp_s, x[_P].copy(), x[_A].copy(), x[_B].copy(), self.P[_POSE, _POSE].copy())
-
-    def copy_state(self) -> Saved:
-        """Everything that changes, for a later `restore`."""
-        return self.x.copy(), self.P.copy(), self.tau_s, dict(self.refused_in_row)
-
-    def restore(self, saved: Saved) -> None:
-        """Restore what `copy_state` returned."""
-        self.x, self.P = np.array(saved[0]), np.array(saved[1])
-        self.tau_s, self.refused_in_row = saved[2], dict(saved[3])
 
 
 def _relative(x: FloatArray, T_clone_b: FloatArray) -> tuple[FloatArray, FloatArray]:
