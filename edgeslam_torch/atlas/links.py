@@ -82,7 +82,7 @@ class Link:
         here, there = (sim3.moved_camera(S, self.keyframe.T_c_w) for S in (self.S, other.S))
         sigma_log = float(np.linalg.norm([self.sigma_log, other.sigma_log, LINK_LOG]))
         scales = float(np.log(sim3.scale_of(self.S) / sim3.scale_of(other.S)))
-        return Belief(LINK_PLACE * self.depth, LINK_RAD, 0.0, sigma_log).allows_pose(here, there, scales)
+        return Belief(LINK_PLACE * self.depth, LINK_RAD, sigma_log).allows_pose(here, there, scales)
 
 
 def view_of(keyframe: Keyframe, scale_factor: float) -> View:

@@ -33,8 +33,7 @@ DRIFT_LOG = 0.02
 PLACE = 0.03
 """Standard deviation of a camera's place by images alone, relative to the depth."""
 PLACE_LOG = 0.07
-"""Standard deviation of the log scale of a view relative to its neighbourhood of seconds, for which sensors measure
-metres."""
+"""Standard deviation of the log scale of a view relative to its neighbourhood."""
 SURE_LOG = 0.1
 """Maximum standard deviation of the log ratio of two scales for a correction."""
 MIN_SHARED = 15
@@ -55,8 +54,8 @@ class Belief:
     sigma_t: float
     """[map units]"""
     sigma_r_rad: float
-    log_scale: float = 0.0
     sigma_log: float = math.inf
+    """Of the scale."""
 
     def allows(self, S: FloatArray, T_c_w: FloatArray) -> bool:
         """Whether a similarity ``(4, 4)`` that images measured for a camera ``(4, 4)`` passes the gate."""
@@ -65,16 +64,14 @@ class Belief:
     def allows_pose(self, T_c_w: FloatArray, measured: FloatArray, log_scale: float | None = None) -> bool:
         """The same of an expected and a measured pose ``(4, 4)``, and of a log scale if one was measured."""
         off = T_c_w @ se3.inverse(measured)
-        scale, sigma_log = (0.0, math.inf) if log_scale is None else (log_scale - self.log_scale, self.sigma_log)
-        residual = np.concatenate([off[:3, 3], se3.log(off)[3:], [scale]])
+        sigma_log = math.inf if log_scale is None else self.sigma_log
+        residual = np.concatenate([off[:3, 3], se3.log(off)[3:], [log_scale or 0.0]])
         sigma = np.repeat([self.sigma_t, self.sigma_r_rad, sigma_log], [3, 3, 1])
         return gate.passes(residual, np.diag(sigma**2))
 
     def plus(self, sigma_t: float, sigma_r_rad: float) -> "Belief":
         """With independent errors of the pose added."""
-        return Belief(
-            math.hypot(self.sigma_t, sigma_t), math.hypot(self.sigma_r_rad, sigma_r_rad), self.log_scale, self.sigma_log
-        )
+        return Belief(math.hypot(self.sigma_t, sigma_t), math.hypot(self.sigma_r_rad, sigma_r_rad), self.sigma_log)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +92,6 @@ class SubmapGraph:
     log: TrajectoryLog
     scale_now: Callable[[], ScaleEstimate] = ScaleEstimate
     """Present metres per map unit."""
-    metres_around: Callable[[float], ScaleEstimate | None] = lambda _: None
-    """Metres per map unit by sensors around the stamp of an earlier frame."""
     metres_along: MetresAlong = lambda *_: None
     starts: dict[int, _Start] = field(default_factory=dict)
     """By the number of the submap."""
@@ -180,13 +175,7 @@ class SubmapGraph:
             return None
         drift, steps = self._drift(one, other)
         sigma_t, sigma_r = math.hypot(sigma_t, drift, PLACE * depth), math.hypot(sigma_r, DRIFT_RAD)
-        if not one_map:
-            return Belief(sigma_t, sigma_r)
-        here, there = (self.metres_around(k.stamp_s) for k in (one, other))
-        if here is None or there is None:
-            return Belief(sigma_t, sigma_r, 0.0, DRIFT_LOG * math.sqrt(steps))
-        ratio, sigma_log = _ratio(here, there)
-        return Belief(sigma_t, sigma_r, math.log(ratio), math.hypot(sigma_log, PLACE_LOG))
+        return Belief(sigma_t, sigma_r, DRIFT_LOG * math.sqrt(steps)) if one_map else Belief(sigma_t, sigma_r)
 
     def _drift(self, one: Keyframe, other: Keyframe) -> tuple[float, int]:
         """Standard deviation of the drift per axis along the path between two keyframes with the least of it, over

@@ -28,8 +28,8 @@ from edgeslam_torch.estimation.telemetry.comparison import Comparison, FlightSoF
 from edgeslam_torch.estimation.telemetry.delay import DelaySearch
 from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, SensorGate
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
-from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, VisualMemory, VisualPose
-from edgeslam_torch.estimation.telemetry_scale import AROUND_S, TelemetryScale, drift_in_words, scale_of
+from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory, VisualPose
+from edgeslam_torch.estimation.telemetry_scale import TelemetryScale, scale_of
 from edgeslam_torch.geometry.level import Up
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.noise import VISUAL_SIGMA
@@ -74,8 +74,6 @@ class MotionFusion:
         self.imu = Imu(ImuModel() if imu is None else imu)
         self._comparison = Comparison(config)
         self._filter = FilterFeed(config, given)
-        self._drift: str | None = None
-        """Warning that parts of the map have different scales."""
         self._fitted_s = -math.inf
         """Stamp of the last fit."""
         self._counts: Counter[str] = Counter()
@@ -191,11 +189,6 @@ class MotionFusion:
         """Metres per map unit with sigma and source; unchanged without new measurements."""
         return self.metres.scale()
 
-    def scale_around(self, stamp_s: float) -> ScaleEstimate | None:
-        """Metres per map unit within seconds of an earlier frame, in the present map; None without telemetry."""
-        moved = self._memory.displacements()
-        return self._scale_of(moved.only((moved.from_s >= stamp_s - AROUND_S) & (moved.to_s <= stamp_s + AROUND_S)))
-
     def scale_along(self, stamps_s: FloatArray, T_w_c: FloatArray) -> ScaleEstimate | None:
         """Metres per map unit along some frames of the flight, ``(F,)`` and ``(F, 4, 4)``; None without telemetry."""
         if len(stamps_s) == 0:
@@ -204,13 +197,12 @@ class MotionFusion:
         memory = VisualMemory(INTERVAL_S, length_s, MAX_GAP_S)
         for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
             memory.add(VisualPose(stamp_s, T, VISUAL_SIGMA, VISUAL_SIGMA))
-        return self._scale_of(memory.displacements())
-
-    def _scale_of(self, moved: Displacements) -> ScaleEstimate | None:
         R_w_m, low = self.orientation.R_w_m, self.metres.fit.shortfall_m_s
         if R_w_m is None or not self._trust.velocity or len(self._track) == 0:
             return None
-        return scale_of(moved, self._track, self.delay_s, R_w_m, self.orientation.T_b_c, self.config, low)
+        return scale_of(
+            memory.displacements(), self._track, self.delay_s, R_w_m, self.orientation.T_b_c, self.config, low
+        )
 
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
         """As `Orientation.vertical`; None if the map did not begin upright, or has a metric scale: attitude in whole
@@ -238,13 +230,11 @@ class MotionFusion:
         return None
 
     def republished(self, published: OutputFrame, centre_map: FloatArray, keep_scale: bool) -> OutputFrame:
-        """The published frame, levelled and, unless ``keep_scale``, with the present scale or guess; the
-        published position of ``centre_map`` ``(3,)`` stays."""
+        """The published frame, levelled and, unless ``keep_scale``, with the present scale; the published position of
+        ``centre_map`` ``(3,)`` stays."""
         upright = self.orientation.upright()
         published = published.turned_upright(self.imu.upright() if upright is None else upright, centre_map)
-        if keep_scale:
-            return published
-        return published.guessed_anew(self.metres.guess, centre_map).revised(self.scale(), centre_map)
+        return published if keep_scale else published.revised(self.scale(), centre_map)
 
     def present(
         self, stamp_s: float, state: str, published: OutputFrame, submap_sigma: float = 0.0, drift_sigma: float = 0.0
@@ -278,7 +268,7 @@ class MotionFusion:
             delay.sigma_s,
             self._track.battery,
             self.filtering,
-            tuple(self._trust.warnings() + [said for said in (doubt, self._drift) if said is not None]),
+            (*self._trust.warnings(), *([] if doubt is None else [doubt])),
         )
 
     def snapshot(self) -> Snapshot | None:
@@ -304,8 +294,7 @@ class MotionFusion:
 
     def warnings(self) -> list[str]:
         """Warnings of a rejected depth network or rejected telemetry."""
-        drift = [] if self._drift is None else [self._drift]
-        return self._trust.warnings() + self._track.warnings() + self.metres.warnings() + drift + self.imu.warnings()
+        return self._trust.warnings() + self._track.warnings() + self.metres.warnings() + self.imu.warnings()
 
     def telemetry(self) -> TelemetryModel | None:
         """Present telemetry and its alignment with the map, for refinement; None without any.
@@ -375,17 +364,10 @@ class MotionFusion:
         orientation.found = turned
         present = FlightSoFar(self._memory, self._track, orientation.T_b_c, metres.rough(), metres.network())
         self._comparison.judge(self._trust, present, self.flight.delay.delay, turned.R_w_m, flying)
-        previous_scale = metres.previous_scale()
-
-        def scale(trust: SensorGate) -> TelemetryScale:
-            T_b_c = orientation.T_b_c
-            return TelemetryScale(self.config, T_b_c, present, trust, self.delay_s, turned, previous_scale, flying)
-
-        metres.take(*scale(self._trust).beliefs(), self._trust)
-        guesses = flying and metres.sensor_scale is None
-        metres.provisional_scale((scale(self._trust.supposing_heights()).beliefs()[0] or {}) if guesses else {})
-        oldest = self._memory.sightings().stamps_s[0]
-        self._drift = drift_in_words(self.scale_around, float(oldest), last.stamp_s)
+        scale = TelemetryScale(
+            self.config, orientation.T_b_c, present, self._trust, self.delay_s, turned, metres.previous_scale(), flying
+        )
+        metres.take(*scale.beliefs(), self._trust)
 
     def _search_delay(self) -> None:
         guessed = not math.isfinite(self.flight.delay_sigma_s)

@@ -47,7 +47,7 @@ class OutputFrame:
     revision: int = 0
     """Number of revisions so far."""
     guessed: bool = True
-    """Whether the scale is still the initial guess, without validated metres."""
+    """Whether the scale is still the initial one, without validated metres."""
     sigma: float = math.inf
     """Relative standard deviation of the scale at its last revision."""
     upright: bool = False
@@ -86,12 +86,6 @@ class OutputFrame:
         """Whether the published scale is the initial guess, and significantly worse than an estimate."""
         off = self._off(estimate)
         return self.guessed and off > max(_GUESS_OFF, _GUESS_CONTRADICTION * estimate.sigma / estimate.value)
-
-    def guessed_anew(self, guess: ScaleEstimate | None, centre_map: FloatArray) -> "OutputFrame":
-        """The same with a better guess of its scale; arguments as for `revised`."""
-        if guess is None or not self._worse_guess(guess):
-            return self
-        return self._rescaled(guess.value, centre_map)
 
     def turned_upright(self, R_w_m: FloatArray | None, centre_map: FloatArray) -> "OutputFrame":
         """The same with z up, by the smallest rotation, if it is not yet level and the attitude is known.

@@ -37,9 +37,6 @@ class ScaleEstimator:
         truncates = config.velocity_rounding == "truncate"
         self.fit = TelemetryFit(shortfall_m_s=0.5 * config.velocity_step_m_s if truncates else 0.0)
         """Details of the newest fit of velocities."""
-        self.guess: ScaleEstimate | None = None
-        """Scale by a climb before telemetry is validated; None afterwards. Not metric: only a better initial value of
-        the published scale than the depth network's."""
         self.inertial: ScaleBelief | None = None
         """Scale by an IMU; None while it is not observable."""
         self._by_telemetry: dict[str, ScaleBelief] = {}
@@ -87,11 +84,6 @@ class ScaleEstimator:
         # Heights alone are void once the map's vertical has changed.
         if set(self._by_telemetry) == {"height"} or not all(trusted[source] for source in self._by_telemetry):
             self._by_telemetry = {}
-
-    def provisional_scale(self, found: Mapping[str, ScaleBelief]) -> None:
-        """Update the guess with heights that are not validated yet."""
-        guess = mean(list(found.values()))
-        self.guess = None if guess is None or guess.sigma >= _BELIEVED else guess.estimate
 
     def follow(self, log_ratio: float) -> None:
         """Adapt the scale to a map that has grown by ``exp(log_ratio)``."""

@@ -4,7 +4,6 @@ A monocular map drifts in scale, so that two places in it may differ; local velo
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,15 +71,10 @@ _LEAST_CHANGES = 2
 or of the map dominates the slope."""
 _MOST_STEPS = 0.3
 """Maximum share of height readings classified as floor steps; furniture causes fewer."""
-AROUND_S = 5.0
-"""Time before and after the moment: four metres each at an indoor drone's speed."""
 _MOST_LOCAL_SIGMA = 0.15
 """Maximum relative standard deviation of a local scale."""
 _LEAST_LOCAL_SIGMA = 0.03
 """Lower bound of the standard deviation: drift within the window."""
-_SIGMAS, _SAID_LOG = 3.0, math.log(1.15)
-"""Minimum significance and size of a reported difference: above the effect of quantised velocities and map
-distortion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -403,30 +397,3 @@ def scale_of(
     if found is None or found.sigma > _MOST_LOCAL_SIGMA:
         return None
     return replace(found, sigma=max(found.sigma, _LEAST_LOCAL_SIGMA)).estimate
-
-
-def drift_in_words(scale_at: Callable[[float], ScaleEstimate | None], from_s: float, to_s: float) -> str | None:
-    """Warning that an earlier part of the map differs significantly in scale from the present one; None otherwise.
-
-    Args:
-        scale_at: Metres per map unit around a moment.
-        from_s: Oldest stored moment.
-        to_s: The present.
-    """
-    now = scale_at(to_s - AROUND_S)
-    if now is None:
-        return None
-    most, said = _SAID_LOG, None
-    for moment_s in np.arange(from_s + AROUND_S, to_s - 3.0 * AROUND_S, 2.0 * AROUND_S).tolist():
-        then = scale_at(moment_s)
-        if then is None:
-            continue
-        gap = abs(math.log(now.value / then.value))
-        if gap > most and gap > _SIGMAS * math.hypot(now.sigma / now.value, then.sigma / then.value):
-            most = gap
-            said = (
-                f"the map's scale has drifted: by telemetry {then.value:.3g} metres per map unit "
-                f"{to_s - moment_s:.0f} s ago and {now.value:.3g} now; distances there are off by "
-                f"{100 * math.expm1(gap):.0f} %"
-            )
-    return said

@@ -100,8 +100,8 @@ class Ring:
     def moved(self, k):
         return sim3.exp(np.multiply.outer(k, self.drift))
 
-    def graph(self, metres=lambda _: None, along=lambda *_: None):
-        return SubmapGraph(self.map, self.log, metres_around=metres, metres_along=along)
+    def graph(self, along=lambda *_: None):
+        return SubmapGraph(self.map, self.log, metres_along=along)
 
     def atlas(self, closing=True, **told):
         return Atlas(self.tracker, self.edges, self.graph(**told), LmConfig(diagnostics=False), closing)
@@ -246,21 +246,6 @@ def test_a_recent_keyframe_is_no_loop_candidate(rng):
     for keyframe in ring.keyframes:
         keyframe.stamp_s *= 0.1
     assert far_keyframes(ring.map, ring.keyframes[-1]) == []
-
-
-def test_telemetry_decides_whether_a_link_is_plausible(rng):
-    """Right links that scale by 0.9: telemetry which is sure of ten times as much speaks against them."""
-    ring = Ring(rng)
-    found = link(ring.tracker, ring.keyframes[ROUND], ring.keyframes[0])
-    grown = float(np.log(sim3.scale_of(found.S)))
-    told = {
-        factor: lambda stamp_s, f=factor: ScaleEstimate(np.exp(f * grown / ROUND * stamp_s), 0.01)
-        for factor in (1, -10)
-    }
-    assert ring.allows(found)
-    assert ring.allows(found, metres=told[1]) and closed(ring, ring.atlas(metres=told[-10])) == []
-    assert not ring.allows(found, metres=told[-10])
-    assert closed(ring, ring.atlas(metres=told[1]))
 
 
 def test_a_loop_beyond_the_drift_allowed_by_telemetry_is_rejected(rng):

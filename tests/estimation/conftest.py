@@ -93,19 +93,35 @@ def _replay(
             fusion.scale()
 
 
-@pytest.fixture
+def _at_once(
+    fusion: MotionFusion, motion: Motion, gauge: Gauge, telemetry: Sequence[TelemetrySample], passes: int = 1
+) -> None:
+    """Give a whole flight, in its map as it is at last: one fit instead of one a second."""
+    fusion.add_telemetry(telemetry)
+    fusion.add_earlier(motion.stamps_s, gauge.T_m_c, gauge.sigma_t, gauge.sigma_r)
+    for _ in range(passes):
+        fusion.revise(motion.stamps_s, gauge.T_m_c)
+
+
+@pytest.fixture(scope="session")
 def swinging() -> Callable[..., Motion]:
     """Function that gives a hand-swung camera: ``swinging(duration_s, rate_hz, size_m)``."""
     return _swinging
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def recorded() -> Callable[[Path], Motion]:
     """Function that reads a ground-truth file."""
     return _recorded
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def replay() -> Callable[..., None]:
     """Function that feeds a `MotionFusion` in the order of stamps."""
     return _replay
+
+
+@pytest.fixture(scope="session")
+def at_once() -> Callable[..., None]:
+    """Function that feeds a `MotionFusion` with a whole flight and lets it fit once."""
+    return _at_once

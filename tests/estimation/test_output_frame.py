@@ -52,20 +52,6 @@ def test_initial_unit_is_revised_sooner_than_a_measured_one(value, sigma, given_
     assert measured.revised(estimate, np.zeros(3)) is measured
 
 
-def test_a_guess_may_follow_a_guess_until_metres_are_measured():
-    here = np.array([1.0, 2.0, 3.0])
-    guess = ScaleEstimate(2.0, 0.4, "height")
-    again = OutputFrame(1.0).guessed_anew(guess, here)
-    assert (again.scale, again.revision, again.guessed) == (2.0, 1, True)
-    np.testing.assert_allclose(again.points(here), OutputFrame(1.0).points(here))
-    assert again.guessed_anew(ScaleEstimate(1.6, 0.1, "height"), here).scale == 1.6
-    for no_better in (None, ScaleEstimate(2.09, 0.01, "height"), ScaleEstimate(1.6, 0.5, "height")):
-        assert again.guessed_anew(no_better, here) is again
-    measured = again.revised(ScaleEstimate(1.5, 0.05, "height"), here)
-    assert (measured.revision, measured.guessed) == (2, False)
-    assert measured.guessed_anew(guess, here) is measured
-
-
 def test_measured_unit_is_revised_only_by_a_more_accurate_one():
     estimate = ScaleEstimate(2.0, 0.24, "telemetry")
     assert OutputFrame(1.0).revised(estimate, np.zeros(3)).revision == 1

@@ -275,15 +275,6 @@ class SensorGate:
             return False
         return own is Verdict.AGREES or (own is Verdict.OPEN and (self.velocity or attitude is Verdict.AGREES))
 
-    def supposing_heights(self) -> "SensorGate":
-        """A copy that provisionally accepts undecided heights."""
-        supposed = SensorGate()
-        supposed.latest, supposed.elsewhere_s = dict(self.latest), self.elsewhere_s
-        supposed._verdicts = dict(self._verdicts)
-        for reading in HEIGHTS:
-            supposed._verdicts.setdefault(reading, Verdict.AGREES)
-        return supposed
-
     @property
     def motion(self) -> bool:
         """Whether telemetry may predict the pose without images: not contradicted."""
