@@ -125,7 +125,7 @@ def rms(values) -> float:
 
 @pytest.fixture(scope="module")
 def scenes(flight: Flight) -> list[Scene]:
-    return [scene(flight, seed) for seed in range(4)]
+    return [scene(flight, seed) for seed in range(3)]
 
 
 @pytest.fixture(scope="module")
@@ -178,19 +178,3 @@ def test_real_tello_flights_run_through_the_filter(data_dir, name):
     assert np.isfinite(state.covariance).all()
     assert counts["attitude accepted"] > 0.97 * 1200
     assert counts.get("attitude refused", 0) + counts.get("attitude recovered", 0) < 0.03 * 1200
-
-
-@pytest.mark.data
-def test_height_from_vertical_velocity_agrees_with_the_range_sensor(data_dir):
-    """Where the floor is flat: one-second changes of tof against integrated vz, flight_a (it climbs and sinks)."""
-    samples = read_telemetry(data_dir / "tello_telemetry" / "flight_a.csv")[0]
-    t = np.array([s.stamp_s for s in samples])
-    vz = np.array([s.velocity_m_s[2] for s in samples])
-    tof = np.array([s.tof_m for s in samples])
-    z = np.concatenate([[0.0], np.cumsum(0.5 * (vz[1:] + vz[:-1]) * np.diff(t))])
-    i = np.arange(len(t) - 10)
-    dz, dtof = z[i + 10] - z[i], tof[i + 10] - tof[i]
-    moving = (np.abs(dz) > 0.1) & np.isfinite(dtof) & (np.abs(dtof) < 1.0)
-    assert moving.sum() > 20
-    assert np.corrcoef(dz[moving], dtof[moving])[0, 1] > 0.9
-    assert 0.8 < np.sum(dz[moving] * dtof[moving]) / np.sum(dz[moving] ** 2) < 1.3

@@ -75,14 +75,6 @@ def turned(motion, share):
     return T_w_c
 
 
-def test_a_moment_that_is_not_known_says_less_of_turns(rng, swinging):
-    motion = swinging(14.0)
-    sure, unsure = (flown(rng, motion, delay_sigma_s=s)[0] for s in (0.0, 0.3))
-    at = motion.stamps_s[np.arange(20, len(motion.stamps_s) - 20, 15)]
-    late = 0.3 * 0.3 * 0.7 * np.cos(0.7 * at)  # of the yaw that is swung
-    assert chi2(unsure, late) < 1.2 < 5.0 < chi2(sure, late)
-
-
 def test_nothing_is_told_without_attitude_or_metres_or_in_a_hole(rng, swinging):
     motion = swinging(14.0)
     assert flown(rng, motion, attitude=False)[0] is None

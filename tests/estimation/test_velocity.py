@@ -1,17 +1,12 @@
 """What whole steps of velocity leave out."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from edgeslam_torch.estimation.config import FusionConfig
-from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.estimation.sensors.velocity import Rounding, remainder, remainder_gain, seen_velocity
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, Sightings
 from edgeslam_torch.geometry.mount import camera_on_body
-from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
 from edgeslam_torch.types import TelemetrySample
 
 T_B_C = camera_on_body()
@@ -47,16 +42,6 @@ def test_a_truncated_flight_loses_half_a_step_on_average(unit):
     np.testing.assert_allclose(lost[1] - lost[0], [4.0 * 0.05, 0.0, 0.0], atol=0.008)
 
 
-def test_no_remainder_without_vision():
-    track, seen = along_x(0.72, 1.0)
-    there = (seen.stamps_s < 2.0) | (seen.stamps_s > 4.0)
-    cut = Sightings(seen.stamps_s[there], seen.T[there], seen.sigma_t[there])
-    lost = seen_velocity(track, cut, 0.0, np.eye(3), T_B_C, 0.35).lost(
-        np.array([2.2, 3.8]), 1.0, 0.1, Rounding.TRUNCATE
-    )
-    np.testing.assert_allclose(lost[1], lost[0], atol=1e-12)
-
-
 def intervals(seen):
     start, end = seen.T[:-10:5, :3, 3], seen.T[5:-5:5, :3, 3]
     n = len(start)
@@ -69,23 +54,3 @@ def test_a_flight_below_one_step_confirms_any_scale(speed_m_s, low, high):
     track, seen = along_x(speed_m_s, 1.0)
     shown = seen_velocity(track, seen, 0.0, np.eye(3), T_B_C, 0.35)
     assert low <= remainder_gain(shown, intervals(seen), np.eye(3), 1.0, 0.1, Rounding.TRUNCATE) <= high
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rounding", list(Rounding))
-def test_slow_flights_have_calibrated_sigma(swinging, replay, rounding):
-    """Speeds of one to two steps: five draws of telemetry, each inside its own three sigmas."""
-    for seed in range(5):
-        rng = np.random.default_rng(seed)
-        motion = swinging(30.0, size_m=0.09)
-        exact = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=replace(EXACT, video_delay_s=0.5)).samples()
-        told = [
-            replace(s, velocity_m_s=0.1 * WHOLE[rounding](10 * (s.velocity_m_s + rng.normal(0, 0.02, 3))),
-                    tof_m=np.nan, height_m=np.nan, baro_m=np.nan)
-            for s in exact
-        ]  # fmt: skip
-        gauge, fusion = motion.in_gauge(rng), MotionFusion(FusionConfig(), T_B_C)
-        replay(fusion, motion, gauge, told)
-        scale = fusion.scale()
-        assert abs(scale.value - gauge.scale) < 3.0 * scale.sigma
-        assert scale.sigma < 0.2 * scale.value

@@ -38,14 +38,6 @@ def test_vertical_compensates_the_video_delay():
     assert before[2] == pytest.approx(0.0, abs=1e-9) and after[2] < -0.17
 
 
-def test_no_vertical_for_a_map_that_began_tilted():
-    assert told(0.0, upright=False).vertical(1.0) is None
-
-
-def test_no_vertical_without_telemetry():
-    assert told(0.0).vertical(9.0) is None
-
-
 def test_strong_lean_needs_validated_attitude_for_the_vertical():
     fusion = told(np.where(np.arange(30) < 20, 0.0, math.radians(20.0)))
     assert fusion.vertical(1.0) is None

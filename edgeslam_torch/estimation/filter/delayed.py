@@ -4,7 +4,7 @@ import bisect
 import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -145,7 +145,8 @@ class BufferedEkf:
     def resumed(self) -> "BufferedEkf":
         """An independent filter that continues from the newest event."""
         other = BufferedEkf(self.config)
-        other._events, other.telemetry_s = self._events[-1:], self.telemetry_s
+        other._events = [replace(event) for event in self._events[-1:]]  # this one may be applied again
+        other.telemetry_s = self.telemetry_s
         return other
 
     def statistics(self) -> dict[str, int]:
