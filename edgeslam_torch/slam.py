@@ -246,7 +246,7 @@ class EdgeSlam:
         system.stage_ms = {}
         system.collect(wait=system.needs_map)
         with system.timed("joining"):
-            joined = self._joining.update(frame.stamp_s)
+            joined = self._joining.update()
         with system.timed("features"):
             seen = prepared if prepared is not None else self.prepare(frame)
             system.shows_nothing_new = self._repeats.repeats(seen.grey, frame.stamp_s)

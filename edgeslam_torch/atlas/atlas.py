@@ -41,18 +41,16 @@ LOOP_VOTES = 20
 wallpaper 22."""
 WITHIN_PX = 5.0
 """Offset up to which tracking and the window find the old anchors without a loop (`mapping/local_loop_closure.py`)."""
-SCALE_AGAIN_S = 2.0
-"""Time between two comparisons of the scales of the camera's submap and the first one."""
 WITNESSES = 4
 """Covisible keyframes that are matched to confirm a new link."""
 
 
 @dataclass(frozen=True, slots=True)
 class MapChange:
-    """A merge of two submaps, a closed loop, or a correction of a submap's scale."""
+    """A merge of two submaps, or a closed loop."""
 
     kind: str
-    """Key in the summary's events: ``joined``, ``loops_closed``, ``rescaled``."""
+    """Key in the summary's events: ``joined``, ``loops_closed``."""
     stamp_s: float
     """Stamp of the confirming keyframe."""
     text: str
@@ -98,8 +96,6 @@ class Atlas:
         """Newest keyframe that was searched."""
         self._loop_searched: Keyframe | None = None
         """Newest keyframe that was searched for a loop."""
-        self._scale_s = -np.inf
-        """Stamp of the last comparison of scales."""
 
     def others(self, piece: int) -> list[Keyframe]:
         """Keyframes of other submaps that have anchors."""
@@ -131,28 +127,6 @@ class Atlas:
         """Search every keyframe in the next `update`."""
         self._searched = -1
         self._loop_searched = None
-
-    def correct_scale(self, stamp_s: float, now: ScaleEstimate | None = None) -> MapChange | None:
-        """Scale the camera's submap to the flight's first one if the drone's sensors show a difference: it began with
-        predicted depths, which may be wrong by half. The caller must own the map.
-
-        Args:
-            stamp_s: Present time.
-            now: Present metres per map unit, if reliable.
-        """
-        if not self.graph.log.records or stamp_s - self._scale_s < SCALE_AGAIN_S:
-            return None
-        piece = self.graph.present
-        if piece == self.graph.first or piece in self.known_scale:
-            return None
-        self._scale_s = stamp_s
-        ratio = self.graph.wrong_scale(now)
-        if ratio is None:
-            return None
-        mine = self._keyframes_of(piece)
-        about = sim3.compose(ratio, np.eye(3), (1.0 - ratio) * self.map.keyframes[min(mine)].centre_w)
-        text = f"piece {piece} scaled by {ratio:.3f} to the previous metres"
-        return self._changed("rescaled", stamp_s, text, self._moved(dict.fromkeys(mine, about)))
 
     # -- search ------------------------------------------------------------------------------------------------
 
@@ -330,7 +304,6 @@ class Atlas:
         """Record a change; waiting links refer to the map before."""
         self._links = []
         change = MapChange(kind, stamp_s, text, scale_change)
-        self.graph.follow(scale_change)
         self.changes.append(change)
         return change
 

@@ -9,7 +9,7 @@ they are believed if they agree with `SubmapGraph.between`.
 import heapq
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -34,8 +34,6 @@ PLACE = 0.03
 """Standard deviation of a camera's place by images alone, relative to the depth."""
 PLACE_LOG = 0.07
 """Standard deviation of the log scale of a view relative to its neighbourhood."""
-SURE_LOG = 0.1
-"""Maximum standard deviation of the log ratio of two scales for a correction."""
 MIN_SHARED = 15
 """Common anchors from which on two keyframes are covisible, as in `SlamMap.covisible`."""
 NEIGHBOURS = 10
@@ -95,8 +93,6 @@ class SubmapGraph:
     metres_along: MetresAlong = lambda *_: None
     starts: dict[int, _Start] = field(default_factory=dict)
     """By the number of the submap."""
-    first_scale: ScaleEstimate = field(default_factory=ScaleEstimate)
-    """Metres per map unit of the first submap, as estimated when the camera left it."""
     _path: dict[int, float] = field(default_factory=dict)
     """Length of the shortest covisibility path [map units] from the first keyframe to others, by their ids."""
     drift: float = 0.0
@@ -108,8 +104,6 @@ class SubmapGraph:
         before = next((p for r in reversed(self.log.records) if (p := self.map.piece_of(r.keyframe_id)) != piece), None)
         if before is None:
             return
-        if before not in self.starts:
-            self.first_scale = self.scale_now()
         earlier_t, earlier_r = self.uncertainty(before, self.first, keyframe.centre_w)
         sigma = math.hypot(sigma_t, earlier_t), math.hypot(sigma_r_rad, earlier_r)
         self.starts[piece] = _Start(keyframe.id, *sigma)
@@ -119,23 +113,12 @@ class SubmapGraph:
         """Number of the submap in which the flight began."""
         return self.map.piece_of(self.log.records[0].keyframe_id)
 
-    @property
-    def present(self) -> int:
-        """Number of the submap of the newest frame."""
-        return self.map.piece_of(self.log.records[-1].keyframe_id)
-
     def add(self, keyframe: Keyframe) -> None:
         """Update the drift with a mapped keyframe: a revisit makes its path short again."""
         near = [k for k in self.map.covisible(keyframe, NEIGHBOURS) if k.id in self._path]
         paths = [self._path[k.id] + float(np.linalg.norm(k.centre_w - keyframe.centre_w)) for k in near]
         self._path[keyframe.id] = min(paths, default=self.drift / DRIFT)
         self.drift = DRIFT * self._path[keyframe.id]
-
-    def follow(self, scale_change: dict[int, float]) -> None:
-        """Update the first scale after keyframes were moved, by the change of scale at each of them."""
-        grown = scale_change.get(self.log.records[0].keyframe_id, 1.0) if self.log.records else 1.0
-        first = self.first_scale
-        self.first_scale = replace(first, value=first.value / grown, sigma=first.sigma / grown)
 
     # -- marginals ---------------------------------------------------------------------------------------------
 
@@ -211,27 +194,6 @@ class SubmapGraph:
         """Scale of another submap relative to a submap by sensors, and the standard deviation of its logarithm."""
         here, there = self.metres(piece), self.metres(other)
         return None if here is None or there is None else _ratio(here, there)
-
-    @property
-    def keeps_scale(self) -> bool:
-        """Whether the camera is in a later submap of significantly another scale than the first one: that corrects the
-        submap (`wrong_scale`) and not the output, which is in the first one's scale."""
-        return self.present in self.starts and _is_other(*_ratio(self.scale_now(), self.first_scale))
-
-    def wrong_scale(self, now: ScaleEstimate | None) -> float | None:
-        """Factor by which the camera's submap must be scaled to the flight's first one; None unless significant.
-
-        Args:
-            now: Present metres per map unit. All frames of the submap count more, but velocities may be missing there.
-        """
-        along = self.scale_between(self.present, self.first)
-        present = _ratio(now, self.first_scale) if now is not None and self.present in self.starts else None
-        return next((ratio[0] for ratio in (along, present) if ratio is not None and _is_other(*ratio)), None)
-
-
-def _is_other(ratio: float, sigma_log: float) -> bool:
-    """Whether a ratio of two scales is known, and significantly other than 1."""
-    return sigma_log <= SURE_LOG and not gate.passes(np.array([math.log(ratio)]), np.array([[sigma_log**2]]))
 
 
 def _ratio(here: ScaleEstimate, there: ScaleEstimate) -> tuple[float, float]:

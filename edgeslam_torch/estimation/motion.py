@@ -229,12 +229,12 @@ class MotionFusion:
                 return Up(*found, source)
         return None
 
-    def republished(self, published: OutputFrame, centre_map: FloatArray, keep_scale: bool) -> OutputFrame:
-        """The published frame, levelled and, unless ``keep_scale``, with the present scale; the published position of
-        ``centre_map`` ``(3,)`` stays."""
+    def republished(self, published: OutputFrame, centre_map: FloatArray) -> OutputFrame:
+        """The published frame, levelled and with the present scale; the published position of ``centre_map`` ``(3,)``
+        stays."""
         upright = self.orientation.upright()
         published = published.turned_upright(self.imu.upright() if upright is None else upright, centre_map)
-        return published if keep_scale else published.revised(self.scale(), centre_map)
+        return published.revised(self.scale(), centre_map)
 
     def present(
         self, stamp_s: float, state: str, published: OutputFrame, submap_sigma: float = 0.0, drift_sigma: float = 0.0

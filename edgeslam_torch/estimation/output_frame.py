@@ -17,21 +17,15 @@ from edgeslam_torch.types import FloatArray, PointCloud, ScaleEstimate
 T_LEVEL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """``T_w_c`` of a level camera that looks along world x: the first pose without attitude."""
 
-SURE = 0.1
-"""Maximum relative sigma of a scale that may revise the published one: below that of depth networks in a new place."""
+SURE = 0.15
+"""Maximum relative sigma of a scale that may revise the published one; depth networks reach 0.16 at best."""
 
 CONTRADICTION = 2.0
 """Deviation of the published scale that triggers a revision [sigmas]."""
 
-GUESS_SURE = 0.15
-_GUESS_CONTRADICTION, _GUESS_OFF = 1.0, 0.05
-"""The same while the scale is still the initial guess, with the minimum deviation of its logarithm. Depth networks
-reach 0.16 at best: a guess is replaced as soon as measured metres are probably better, unless the change is
-negligible."""
-
 _IMPROVED = 0.5
-"""Share of the published scale's sigma at which an IMU's estimate replaces it, if it is off by more than the new sigma:
-an IMU's first estimate is good to a tenth, and to a hundredth ten seconds later."""
+"""Share of the published scale's sigma at which an estimate replaces it if it is off by more than the new sigma. The
+initial guess has an infinite one; an IMU's first estimate is good to a tenth, and to a hundredth ten seconds later."""
 
 MEASURED = frozenset({"telemetry", "height", "imu"})
 """Sources that measure metres; the depth network has set the initial guess already."""
@@ -46,10 +40,8 @@ class OutputFrame:
     offset: FloatArray = field(default_factory=lambda: np.zeros(3))
     revision: int = 0
     """Number of revisions so far."""
-    guessed: bool = True
-    """Whether the scale is still the initial one, without validated metres."""
     sigma: float = math.inf
-    """Relative standard deviation of the scale at its last revision."""
+    """Relative standard deviation of the scale at its last revision; infinite for the initial guess."""
     upright: bool = False
     """Whether the axes are final: z up by the drone's attitude, or those of an earlier flight."""
 
@@ -82,11 +74,6 @@ class OutputFrame:
         """Deviation of the published scale from an estimate, in the logarithm."""
         return abs(math.log(estimate.value / self.scale))
 
-    def _worse_guess(self, estimate: ScaleEstimate) -> bool:
-        """Whether the published scale is the initial guess, and significantly worse than an estimate."""
-        off = self._off(estimate)
-        return self.guessed and off > max(_GUESS_OFF, _GUESS_CONTRADICTION * estimate.sigma / estimate.value)
-
     def turned_upright(self, R_w_m: FloatArray | None, centre_map: FloatArray) -> "OutputFrame":
         """The same with z up, by the smallest rotation, if it is not yet level and the attitude is known.
 
@@ -104,33 +91,21 @@ class OutputFrame:
         R = smallest_rotation(self.R @ up_map, np.array([0.0, 0.0, 1.0])) @ self.R
         return replace(self, R=R, offset=self.offset + self.scale * ((self.R - R) @ centre_map))
 
-    def _rescaled(self, scale: float, centre_map: FloatArray) -> "OutputFrame":
-        offset = self.offset + (self.scale - scale) * (self.R @ centre_map)
-        return replace(self, scale=scale, offset=offset, revision=self.revision + 1)
-
     def revised(self, estimate: ScaleEstimate, centre_map: FloatArray) -> "OutputFrame":
-        """The same at an estimated scale, if that is measured, accurate and contradicts the published one.
+        """The same at an estimated scale, if that is measured, accurate, and contradicts the published one or is much
+        more accurate.
 
         Args:
             estimate: Metres per map unit.
             centre_map: Point of the map ``(3,)`` whose published position stays.
         """
-        if not self.is_wrong_by(estimate):
-            return self
         sigma = estimate.sigma / estimate.value
-        return replace(self._rescaled(estimate.value, centre_map), guessed=False, sigma=sigma)
-
-    def _improves(self, estimate: ScaleEstimate) -> bool:
-        """Whether an IMU's estimate is much better than the published scale."""
-        sigma = estimate.sigma / estimate.value
-        return "imu" in estimate.source and sigma < _IMPROVED * self.sigma and self._off(estimate) > sigma
-
-    def is_wrong_by(self, estimate: ScaleEstimate) -> bool:
-        """Whether an estimate [metres per map unit] is measured, accurate, and contradicts the published scale."""
+        better = sigma < _IMPROVED * self.sigma and self._off(estimate) > sigma
         measured = not MEASURED.isdisjoint(estimate.source.split("+"))
-        sure = GUESS_SURE if self.guessed else SURE
-        wrong = self.contradicts(estimate) or self._worse_guess(estimate) or self._improves(estimate)
-        return measured and estimate.sigma < sure * estimate.value and wrong
+        if not (measured and sigma < SURE and (better or self.contradicts(estimate))):
+            return self
+        offset = self.offset + (self.scale - estimate.value) * (self.R @ centre_map)
+        return replace(self, scale=estimate.value, offset=offset, revision=self.revision + 1, sigma=sigma)
 
 
 def first_pose(rpy_rad: FloatArray, T_b_c: FloatArray) -> FloatArray:

@@ -85,12 +85,6 @@ class ScaleEstimator:
         if set(self._by_telemetry) == {"height"} or not all(trusted[source] for source in self._by_telemetry):
             self._by_telemetry = {}
 
-    def follow(self, log_ratio: float) -> None:
-        """Adapt the scale to a map that has grown by ``exp(log_ratio)``."""
-        self._by_telemetry = {
-            name: replace(belief, log_scale=belief.log_scale - log_ratio) for name, belief in self._by_telemetry.items()
-        }
-
     # --- output --------------------------------------------------------------------------------------------------
 
     @property

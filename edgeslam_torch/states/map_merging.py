@@ -1,7 +1,5 @@
 """Merging of submaps and loop closure between two frames; the current pose is transformed with the map."""
 
-import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -21,22 +19,14 @@ class MapMerging:
         self._piece: int | None = None
         """Submap whose scale is published."""
 
-    def update(self, stamp_s: float = math.inf) -> str:
-        """Merge submaps and close loops that the newest keyframes connect; returns a description, empty without any.
-
-        Args:
-            stamp_s: Stamp of the present frame.
-        """
+    def update(self) -> str:
+        """Merge submaps and close loops that the newest keyframes connect; returns a description, empty without any."""
         system, changes = self.system, []
         if system.mapping.busy or not system.log.records:
             return ""
-        if len(system.map.begun) > 1:
-            scale = system.fusion.scale()
-            now = scale if system.published.is_wrong_by(scale) else None
-            changes.append(self._followed(lambda: self.atlas.correct_scale(stamp_s, now)))
-        while not self.atlas.is_up_to_date and (found := self._followed(self.atlas.update)):
+        while not self.atlas.is_up_to_date and (found := self._followed()):
             changes.append(found)
-        return "; ".join(str(change) for change in changes if change is not None)
+        return "; ".join(map(str, changes))
 
     def enter(self, piece: int) -> None:
         """Publish in the metric scale of the camera's submap where an earlier flight has determined it."""
@@ -50,7 +40,8 @@ class MapMerging:
             return
         published = replace(system.published, upright=True)
         if published.scale != known.value or published.offset.any() or not np.array_equal(published.R, np.eye(3)):
-            published = OutputFrame(known.value, revision=published.revision + 1, guessed=False, upright=True)
+            sigma = known.sigma / known.value
+            published = OutputFrame(known.value, revision=published.revision + 1, sigma=sigma, upright=True)
         system.published = published
 
     def finish(self) -> None:
@@ -59,18 +50,16 @@ class MapMerging:
             self.atlas.search_all_again()
         self.update()
 
-    def _followed(self, change_map: Callable[[], MapChange | None]) -> MapChange | None:
-        """Change the map, and transform the current pose and the metric scale with it."""
+    def _followed(self) -> MapChange | None:
+        """Change the map by the next merge or loop, and transform the current pose and the metric scale with it."""
         system = self.system
         last = system.log.records[-1].keyframe_id
         T_c_k = system.motion.T_c_w @ se3.inverse(system.map.pose_of(last))
-        change = change_map()
+        change = self.atlas.update()
         if change is None:
             return None
         scale = change.growth(last)
         system.motion.transform(se3.scaled(T_c_k, scale) @ system.map.pose_of(last), scale)
-        if change.kind == "rescaled":  # the scale estimate without new measurements is that of this submap
-            system.fusion.metres.follow(math.log(scale))
         system.compare_depths_again()
         system.fusion.revise(*system.log.poses())
         # Poses published before belong to the map before the change.

@@ -136,7 +136,7 @@ class System:
         T_w_c = se3.inverse(track.T_c_w)
         with self.timed("fusion"):
             self.fusion.add_visual(stamp_s, T_w_c, *_sigmas(track))
-            self.published = self.fusion.republished(self.published, T_w_c[:3, 3], self.graph.keeps_scale)
+            self.published = self.fusion.republished(self.published, T_w_c[:3, 3])
 
     def position_sigmas(self, piece: int) -> tuple[float, float]:
         """`Health.submap_sigma` and `drift_sigma` of the present pose in a submap."""

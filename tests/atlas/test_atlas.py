@@ -7,7 +7,7 @@ import pytest
 from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map
 
 from edgeslam_torch.atlas import links
-from edgeslam_torch.atlas.atlas import SCALE_AGAIN_S, Atlas
+from edgeslam_torch.atlas.atlas import Atlas
 from edgeslam_torch.atlas.links import agreed_scale, link, log_ratios, on_one_plane, view_of
 from edgeslam_torch.atlas.place_recognition import revisit_candidates
 from edgeslam_torch.atlas.relaxation import move
@@ -345,80 +345,6 @@ def test_drift_of_the_older_submap_is_distributed_over_it(rng, by_sensors):
     join = pieces.atlas(start_sigma=0.01 if by_sensors else np.inf).update()
     assert len(join.scale_change) == (8 if by_sensors else 4)
     assert pieces.position_error() < 0.02
-
-
-def test_a_submap_is_scaled_to_the_unit_of_the_first_one(rng):
-    """Anchors, keyframes and frames, about where it began; what its cameras see stays the same."""
-    pieces = Pieces(rng, misplaced=CARRIED)
-    before = [k.centre_w for k in pieces.keyframes]
-    pixels = [pixels_of(pieces, k) for k in pieces.keyframes]
-    atlas = pieces.atlas(metres_along=metres_along(2.0 * 1.5))
-    done = atlas.correct_scale(1.0)
-    assert (done.kind, done.growth(5), done.growth(1)) == ("rescaled", pytest.approx(1.5), 1.0)
-    began = before[4]
-    for k, keyframe in enumerate(pieces.keyframes):
-        there = before[k] if k < 4 else began + 1.5 * (before[k] - began)
-        np.testing.assert_allclose(keyframe.centre_w, there, atol=1e-9)
-        np.testing.assert_allclose(pixels_of(pieces, keyframe), pixels[k], atol=1e-6)
-    check_map(pieces.map)
-    assert atlas.correct_scale(1.0 + 0.9 * SCALE_AGAIN_S) is None, "not at each frame"
-
-
-@pytest.mark.parametrize("along", [2.0 * 1.02, None])
-def test_the_scale_in_flight_is_used_if_velocities_of_a_submap_give_none(rng, along):
-    """A drone that climbs on the spot in its piece: heights alone tell the unit."""
-
-    def told(stamps_s, T_w_c):
-        value = 2.0 if stamps_s[0] == 0.0 else along
-        return None if value is None else ScaleEstimate(value, 0.02 * value, "telemetry")
-
-    def factor(now, metres):
-        pieces = Pieces(rng, misplaced=CARRIED)
-        atlas = pieces.atlas(metres_along=metres, scale_now=lambda: ScaleEstimate(2.0, 0.02, "telemetry"))
-        change = atlas.correct_scale(1.0, ScaleEstimate(now, 0.04, "height"))
-        return None if change is None else change.growth(5)
-
-    assert factor(1.8, told) == pytest.approx(0.9)
-    assert factor(1.94, told) is None
-    assert factor(1.8, metres_along(2.0 * 1.5)) == pytest.approx(1.5), "all of the piece before the present"
-
-
-@pytest.mark.parametrize(
-    ("second", "sigma", "why"),
-    [
-        (2.0 * 1.04, 0.02, "within two sigmas"),
-        (2.0 * 1.5, 0.09, "not sure"),
-        (None, 0.02, "nothing tells"),
-    ],
-)
-def test_a_submap_keeps_its_scale_without_a_significant_error(rng, second, sigma, why):
-    def told(stamps_s, T_w_c):
-        first = stamps_s[0] == 0.0
-        if not first and second is None:
-            return None
-        value = 2.0 if first else second
-        return ScaleEstimate(value, sigma * value, "telemetry")
-
-    pieces = Pieces(rng, misplaced=CARRIED)
-    before = [k.T_c_w.copy() for k in pieces.keyframes]
-    assert pieces.atlas(metres_along=told).correct_scale(1.0) is None, why
-    for keyframe, T_c_w in zip(pieces.keyframes, before, strict=True):
-        np.testing.assert_array_equal(keyframe.T_c_w, T_c_w)
-
-
-def test_the_first_submap_and_a_loaded_one_keep_their_scale(rng):
-    pieces = Pieces(rng, misplaced=CARRIED)
-    atlas = pieces.atlas(metres_along=metres_along(3.0))
-    atlas.known_scale[1] = ScaleEstimate(1.0, 0.02, "atlas")
-    assert atlas.correct_scale(1.0) is None
-    atlas = pieces.atlas(metres_along=metres_along(3.0))
-    del pieces.log.records[4:]  # the camera is in the first piece
-    assert atlas.correct_scale(1.0) is None
-
-
-def pixels_of(pieces, keyframe):
-    held = keyframe.keypoints_with_anchor()
-    return CAMERA.project(se3.transform(keyframe.T_c_w, pieces.map.anchors.p_w[keyframe.anchor[held]]))
 
 
 def test_an_unreachable_submap_is_not_merged(rng):

@@ -97,34 +97,6 @@ def test_the_first_submap_of_a_flight_has_no_uncertainty():
     assert graph.uncertainty(3, graph.first, at(9.0)) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("now", "first_sigma", "factor"),
-    [
-        (ScaleEstimate(0.6, 0.012, "height"), 0.01, 1.2),
-        (ScaleEstimate(0.6, 0.07, "height"), 0.01, None),
-        (ScaleEstimate(0.6, 0.012, "height"), np.inf, None),
-        (ScaleEstimate(0.52, 0.012, "height"), 0.01, None),
-        (None, 0.01, None),
-    ],
-    ids=["both certain", "present uncertain", "first unknown", "equal", "nothing reliable"],
-)
-def test_a_different_scale_in_a_later_submap_belongs_to_that_submap(now, first_sigma, factor):
-    """Applied to the whole map, it would falsify the scale of all earlier output."""
-    world = World([0.0, 1.0], [0, 1])
-    graph = world.graph(2.0 * first_sigma)
-    assert not graph.keeps_scale
-    world.begin(graph, 1, 0.1, 0.1)
-    graph.scale_now = lambda: now or ScaleEstimate(0.5, 0.01, "telemetry")
-    assert graph.keeps_scale == (factor is not None)
-    assert graph.wrong_scale(now) == (None if factor is None else pytest.approx(factor))
-    graph.follow({1: 3.0})
-    assert graph.first_scale.value == 0.5, "the first submap is unchanged"
-    graph.follow({0: 1.1})
-    assert graph.first_scale.value == pytest.approx(0.5 / 1.1)
-    world.piece = [0, 0]
-    assert not graph.keeps_scale, "after merging it applies to the whole map"
-
-
 def drifts(world):
     graph = world.graph()
     return [(graph.add(k), graph.drift / DRIFT)[1] for k in world.keyframes]

@@ -47,7 +47,6 @@ class Pieces:
         return SimpleNamespace(
             update=update,
             search_all_again=lambda: None,
-            correct_scale=lambda stamp_s, now: None,
             is_up_to_date=False,
             is_divided=True,
             known_scale={},
@@ -62,7 +61,7 @@ def system_of(pieces, motion, busy=False):
         revise=lambda *poses: revised.append(poses),
         revised=revised,
         scale=lambda: ScaleEstimate(2.0, 0.02, "telemetry"),
-        metres=SimpleNamespace(remember=remembered.append, follow=lambda log: revised.append(pytest.approx(log))),
+        metres=SimpleNamespace(remember=remembered.append),
         remembered=remembered,
     )
     mapping = SimpleNamespace(busy=busy)
@@ -112,32 +111,6 @@ def test_the_pose_stays_when_the_other_submap_is_moved(rng):
     system = system_of(Pieces(T_k_w), motion)
     MapMerging(system, system.map.atlas(moved=0)).update()
     np.testing.assert_allclose((motion.T_c_w, motion.predict(1.3)), before, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", ["loops_closed", "rescaled"])
-def test_the_pose_is_transformed_by_a_change_of_the_map(rng, kind):
-    """By the change of scale at its own keyframe; without new measurements only a rescaled map has another scale."""
-    T_k_w, motion = moving(rng)
-    p = rng.normal(size=(20, 3))
-    before = se3.transform(motion.T_c_w, p)
-    pieces = Pieces(T_k_w)
-
-    def change(*_):
-        if pieces.queries:
-            return None
-        pieces.queries += 1
-        pieces.T_k_w = sim3.moved_camera(S, T_k_w)
-        return MapChange(kind, 1.0, "in words", {KEYFRAME: 1.5, 3: 1.1})
-
-    system = system_of(pieces, motion)
-    none = lambda *_: None  # noqa: E731
-    update, correct_scale = (change, none) if kind == "loops_closed" else (none, change)
-    atlas = SimpleNamespace(update=update, correct_scale=correct_scale, is_up_to_date=False)
-    assert MapMerging(system, atlas).update() == "in words"
-    np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(S, p)), 1.5 * before, atol=1e-9)
-    assert (system.published.revision, system.events) == (1, {kind: 1})
-    followed = [np.log(1.5)] if kind == "rescaled" else []
-    assert system.fusion.revised == [*followed, "ratios", ("stamps", "poses")]
 
 
 @pytest.mark.parametrize("finish", [False, True])
