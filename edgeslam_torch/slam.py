@@ -135,7 +135,7 @@ class EdgeSlam:
         mapper = Mapper(self.map, camera, config, lm, self.edges)
         fusion = MotionFusion(config.fusion, self._T_b_c, camera.focal_sigma, self.imu)
         fusion.refined_poses = self.log.poses
-        graph = SubmapGraph(self.map, self.log, fusion.scale, fusion.scale_along)
+        graph = SubmapGraph(self.map, self.log, fusion.scale)
         self._system = System(
             camera,
             config,

@@ -166,12 +166,11 @@ class Atlas:
         """
         mine, theirs = self.map.piece_of(keyframe.id), self.map.piece_of(other.id)
         if mine == theirs:
-            found = link(self.tracker, keyframe, other, LOOP_SHARE, lambda: (1.0, PLACE_LOG))
+            found = link(self.tracker, keyframe, other, LOOP_SHARE, (1.0, PLACE_LOG))
             if found is None or (not found.by_images and self._is_flat(found)):
                 return None
         else:
-            scale_between = lambda: self.graph.scale_between(mine, theirs)  # noqa: E731
-            found = link(self.tracker, keyframe, other, scale_between=scale_between)
+            found = link(self.tracker, keyframe, other)
             if found is None:
                 return None
         belief = self.graph.between(keyframe, other, found.depth)
@@ -230,7 +229,7 @@ class Atlas:
         off = best.keyframe.T_c_w @ se3.inverse(sim3.moved_camera(best.S, best.keyframe.T_c_w))
         shift, turn = np.linalg.norm(off[:3, 3]) / best.depth, np.linalg.norm(se3.log(off)[3:])
         with self.map.lock:  # a consistent snapshot for readers
-            scale_change = self._moved(relaxed(self.map, links, {}))
+            scale_change = self._moved(relaxed(self.map, links))
             share_anchors(self.map, links)
             look_around(self.map, self.tracker.camera, links)  # later windows and the final refinement do the rest
         since = f"after {away_s:.1f} s" if np.isfinite(away_s) else "from an earlier flight"
@@ -253,18 +252,13 @@ class Atlas:
         return bool(np.median(off) <= WITHIN_PX and scale <= 3.0 * np.hypot(one.sigma_log, LINK_LOG))
 
     def _join(self, links: list[Link]) -> MapChange:
-        """Merge two submaps: the smaller one is moved. Where sensors relate them, the correction is relative to their
-        prediction the drift of the older one, and is distributed over both."""
+        """Merge two submaps: the smaller one is moved."""
         best = max(links, key=lambda one: len(one.keypoint))
         mine, theirs = self._pieces(best)
         moved, S = mine, best.S
         if self._weight(mine) > self._weight(theirs):
             moved, S = theirs, sim3.inverse(best.S)
-        if self._is_sensed(min(mine, theirs), max(mine, theirs)):
-            similarity = relaxed(self.map, links, {moved: S}, sensed=True)
-        else:
-            similarity = dict.fromkeys(self._keyframes_of(moved), S)
-        scale_change = self._moved(similarity)
+        scale_change = self._moved(dict.fromkeys(self._keyframes_of(moved), S))
         merge_submaps(self.map, self.tracker.camera, links, self.lm)
         scales = {piece: self.known_scale.pop(piece, None) for piece in (mine, theirs)}
         stayed = scales[mine if moved == theirs else theirs]
@@ -276,18 +270,6 @@ class Atlas:
             f"piece {max(mine, theirs)} joined piece {min(mine, theirs)}: {_evidence(links)}, "
             f"piece {moved} scaled by {sim3.scale_of(S):.3f}",
             scale_change,
-        )
-
-    def _is_sensed(self, older: int, newer: int) -> bool:
-        """Whether sensors predicted the start of a submap from the last keyframe of another one."""
-        first = min(self._keyframes_of(newer))
-        before = max((id for id in self.map.keyframes if id < first), default=None)
-        start = self.graph.starts.get(newer)
-        return (
-            before is not None
-            and self.map.piece_of(before) == older
-            and start is not None
-            and bool(np.isfinite(start.sigma_t))
         )
 
     def _weight(self, piece: int) -> tuple[bool, int]:

@@ -6,7 +6,6 @@ ratios must agree. A camera that rotates in place has no such pairs; sensors may
 keyframe, relocalised in the first submap, must confirm the similarity.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,10 +51,6 @@ LINK_RAD = np.deg2rad(1.2)
 LINK_LOG = 0.01
 """Standard deviation of the log scale of a link in a bent map, beside that of its depths."""
 
-ScaleBetween = Callable[[], tuple[float, float] | None]
-"""Scale of the other keyframe's submap relative to the keyframe's, and the standard deviation of its log, by sensors
-other than the camera; None if unknown."""
-
 
 @dataclass(frozen=True, slots=True)
 class Link:
@@ -96,7 +91,7 @@ def link(
     keyframe: Keyframe,
     other: Keyframe,
     min_share: float = LIKELY_SHARE,
-    scale_between: ScaleBetween = lambda: None,
+    otherwise: tuple[float, float] | None = None,
 ) -> Link | None:
     """Pose of a keyframe in another keyframe's submap; None unless it is verified.
 
@@ -105,7 +100,8 @@ def link(
         keyframe: To be located.
         other: Keyframe that may show the same place.
         min_share: Share of the anchors in view that must be matched, in both directions.
-        scale_between: Gives the scale where images have too few depths on both sides.
+        otherwise: Scale of the other submap relative to the keyframe's, and the standard deviation of its log, where
+            images have too few depths on both sides; None refuses the link.
     """
     there = _place(tracker, keyframe, other, min_share)
     if there is None:
@@ -116,7 +112,7 @@ def link(
     by_images = len(ratio) >= MIN_COMMON
     if not by_images and there.share < SENSOR_SCALE_SHARE:
         return None
-    scale = agreed_scale(ratio) if by_images else scale_between()
+    scale = agreed_scale(ratio) if by_images else otherwise
     if scale is None:
         return None
     S = se3.inverse(there.track.T_c_w) @ sim3.compose(scale[0], np.eye(3), np.zeros(3)) @ keyframe.T_c_w

@@ -23,8 +23,6 @@ from edgeslam_torch.optim.pose_graph import PoseGraph, solve
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.types import FloatArray, IntArray
 
-SENSED_SHARED = 100
-"""Equivalent number of common keypoints of a motion predicted by sensors, accurate to centimetres."""
 MIN_BASELINE = 0.02
 """Minimum distance of two keyframes relative to the depth: bounds the weight of their relative scale from below."""
 RADIUS_PX = 12.0
@@ -36,21 +34,11 @@ AROUND = 10
 ITERATIONS = 20
 
 
-def relaxed(
-    slam_map: SlamMap, links: list[Link], S_piece: dict[int, FloatArray], sensed: bool = False
-) -> dict[int, FloatArray]:
-    """Similarity ``(4, 4)`` of every keyframe that makes both ends of links agree.
-
-    Args:
-        slam_map: With the submaps of the links, not merged yet.
-        links: Within one submap, or between two.
-        S_piece: Similarity of a submap by which its links already agree, by its number.
-        sensed: Whether the drone's sensors predicted where the newer submap begins.
-    """
-    pieces = {slam_map.piece_of(k.id) for one in links for k in (one.keyframe, one.other)}
-    members = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) in pieces]
+def relaxed(slam_map: SlamMap, links: list[Link]) -> dict[int, FloatArray]:
+    """Similarity ``(4, 4)`` of every keyframe of a submap that makes both ends of links in it agree."""
+    piece = slam_map.piece_of(links[0].keyframe.id)
+    members = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
     row_of = {k.id: row for row, k in enumerate(members)}
-    piece = np.array([slam_map.piece_of(k.id) for k in members])
     depth = [slam_map.median_depth(k) or 1.0 for k in members]
     T = np.stack([k.T_c_w for k in members])
     i, j, S_ij, inv_sigma = [], [], [], []
@@ -63,21 +51,14 @@ def relaxed(
 
     for (a, b), count in shared_anchors(slam_map, members).items():
         relative = T[a] @ se3.inverse(T[b])
-        if piece[a] == piece[b]:
-            add(a, b, relative, count, max(float(np.linalg.norm(relative[:3, 3])) / depth[a], MIN_BASELINE))
-    if sensed:
-        newer = int(np.flatnonzero(piece == max(pieces))[0])
-        grown = [sim3.scale_of(S_piece.get(number, np.eye(4))) for number in (min(pieces), max(pieces))]
-        S = sim3.compose(grown[0] / grown[1], np.eye(3), np.zeros(3)) @ T[newer] @ se3.inverse(T[newer - 1])
-        add(newer, newer - 1, S, SENSED_SHARED, 1.0)
+        add(a, b, relative, count, max(float(np.linalg.norm(relative[:3, 3])) / depth[a], MIN_BASELINE))
     for one in links:
         a, b = row_of[one.keyframe.id], row_of[one.other.id]
         S = T[a] @ sim3.inverse(one.S) @ se3.inverse(T[b])
         add(a, b, S, len(one.keypoint), 1.0 if one.by_images else MIN_BASELINE)
-    before = np.stack([T[row] @ sim3.inverse(S_piece.get(int(p), np.eye(4))) for row, p in enumerate(piece)])
     old = np.flatnonzero([k.stamp_s == BEFORE_S for k in members])
     fixed = old if len(old) else np.zeros(1, dtype=np.int64)  # keyframes of an earlier flight define axes and scale
-    nodes = solve(PoseGraph(before, fixed, np.array(i), np.array(j), np.stack(S_ij), np.stack(inv_sigma)))
+    nodes = solve(PoseGraph(T, fixed, np.array(i), np.array(j), np.stack(S_ij), np.stack(inv_sigma)))
     return {k.id: np.linalg.inv(node) @ k.T_c_w for k, node in zip(members, nodes, strict=True)}
 
 

@@ -1,9 +1,9 @@
 """The submap graph: what is known of the relative pose and scale of two places before images compare them.
 
 Nodes are submaps. A later submap begins at a predicted pose: that is a link to the one before, with the covariance of
-the drone's sensors, or none without them. Inside a submap the map drifts along covisible keyframes. Metres per map unit
-by sensors compare the scale of both places. Images add the links that merge submaps and close loops (`atlas/atlas.py`);
-they are believed if they agree with `SubmapGraph.between`.
+the drone's sensors, or none without them. Inside a submap the map drifts along covisible keyframes. Images add the
+links that merge submaps and close loops (`atlas/atlas.py`); they are believed if they agree with
+`SubmapGraph.between`.
 """
 
 import heapq
@@ -36,13 +36,12 @@ PLACE_LOG = 0.07
 """Standard deviation of the log scale of a view relative to its neighbourhood."""
 MIN_SHARED = 15
 """Common anchors from which on two keyframes are covisible, as in `SlamMap.covisible`."""
+SENSORS = frozenset({"telemetry", "height", "imu"})
+"""Sources of a scale that measure metres along the path."""
 NEIGHBOURS = 10
 """Maximum number of graph edges from a keyframe to older covisible ones."""
 _MIN_DISTANCE = 1e-9
 """Minimum length of a graph edge [map units]; a sparse graph takes 0 for a missing edge."""
-
-MetresAlong = Callable[[FloatArray, FloatArray], ScaleEstimate | None]
-"""Metres per map unit along frames by the drone's sensors, from stamps ``(F,)`` and poses ``(F, 4, 4)``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +89,6 @@ class SubmapGraph:
     log: TrajectoryLog
     scale_now: Callable[[], ScaleEstimate] = ScaleEstimate
     """Present metres per map unit."""
-    metres_along: MetresAlong = lambda *_: None
     starts: dict[int, _Start] = field(default_factory=dict)
     """By the number of the submap."""
     _path: dict[int, float] = field(default_factory=dict)
@@ -170,7 +168,7 @@ class SubmapGraph:
         members = [k for _, k in sorted(self.map.keyframes.items())]
         row_of = {k.id: row for row, k in enumerate(members)}
         oldest = min(self.map.piece_of(one.id), self.map.piece_of(other.id))
-        drift_share = SENSOR_DRIFT if self.metres(oldest) is not None else DRIFT
+        drift_share = DRIFT if SENSORS.isdisjoint(self.scale_now().source.split("+")) else SENSOR_DRIFT
         share = np.array([drift_share if self.map.piece_of(k.id) == oldest else DRIFT for k in members])
         centre = np.stack([k.centre_w for k in members])
         i, j = np.array(list(shared_anchors(self.map, members)), dtype=np.int64).reshape(-1, 2).T
@@ -180,25 +178,6 @@ class SubmapGraph:
             ways[a].append((b, length))
             ways[b].append((a, length))
         return _least_drift(ways, row_of[one.id], row_of[other.id])
-
-    # -- scale -------------------------------------------------------------------------------------------------
-
-    def metres(self, piece: int) -> ScaleEstimate | None:
-        """Metres per map unit along the frames that a submap supports, by the drone's sensors."""
-        support = self.log.support()
-        use = (support.piece == piece) & support.supported
-        stamps_s, T_w_c = self.log.poses()
-        return self.metres_along(stamps_s[use], T_w_c[use])
-
-    def scale_between(self, piece: int, other: int) -> tuple[float, float] | None:
-        """Scale of another submap relative to a submap by sensors, and the standard deviation of its logarithm."""
-        here, there = self.metres(piece), self.metres(other)
-        return None if here is None or there is None else _ratio(here, there)
-
-
-def _ratio(here: ScaleEstimate, there: ScaleEstimate) -> tuple[float, float]:
-    """Ratio of two scales, and the standard deviation of its logarithm."""
-    return here.value / there.value, math.hypot(here.sigma / here.value, there.sigma / there.value)
 
 
 def _least_drift(ways: dict[int, list[tuple[int, float]]], here: int, there: int) -> tuple[float, int]:

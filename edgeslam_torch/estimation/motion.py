@@ -29,10 +29,9 @@ from edgeslam_torch.estimation.telemetry.delay import DelaySearch
 from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, SensorGate
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory, VisualPose
-from edgeslam_torch.estimation.telemetry_scale import TelemetryScale, scale_of
+from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
 from edgeslam_torch.geometry.level import Up
 from edgeslam_torch.imu import ImuModel, ImuReadings
-from edgeslam_torch.noise import VISUAL_SIGMA
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
 
 _REFIT_S = 1.0
@@ -188,21 +187,6 @@ class MotionFusion:
     def scale(self) -> ScaleEstimate:
         """Metres per map unit with sigma and source; unchanged without new measurements."""
         return self.metres.scale()
-
-    def scale_along(self, stamps_s: FloatArray, T_w_c: FloatArray) -> ScaleEstimate | None:
-        """Metres per map unit along some frames of the flight, ``(F,)`` and ``(F, 4, 4)``; None without telemetry."""
-        if len(stamps_s) == 0:
-            return None
-        length_s = float(stamps_s[-1] - stamps_s[0]) + WINDOW_S
-        memory = VisualMemory(INTERVAL_S, length_s, MAX_GAP_S)
-        for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
-            memory.add(VisualPose(stamp_s, T, VISUAL_SIGMA, VISUAL_SIGMA))
-        R_w_m, low = self.orientation.R_w_m, self.metres.fit.shortfall_m_s
-        if R_w_m is None or not self._trust.velocity or len(self._track) == 0:
-            return None
-        return scale_of(
-            memory.displacements(), self._track, self.delay_s, R_w_m, self.orientation.T_b_c, self.config, low
-        )
 
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
         """As `Orientation.vertical`; None if the map did not begin upright, or has a metric scale: attitude in whole

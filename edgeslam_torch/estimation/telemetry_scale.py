@@ -4,7 +4,7 @@ A monocular map drifts in scale, so that two places in it may differ; local velo
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -34,19 +34,17 @@ from edgeslam_torch.estimation.telemetry.sensor_validation import (
     agreement,
     changes,
 )
-from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements
 from edgeslam_torch.noise import (
     HEIGHT_M,
     HEIGHT_SCALE_LOG,
     HEIGHT_STEP_M,
     MAP_WANDER_LOG,
-    MOUNT_RAD,
     VELOCITY_M_S,
     VELOCITY_SCALE_LOG,
     VELOCITY_TRUNCATED_SCALE_LOG,
 )
-from edgeslam_torch.types import FloatArray, IntArray, ScaleEstimate
+from edgeslam_torch.types import FloatArray, IntArray
 
 _MOST_ROUNDS = 5
 _SETTLED = 0.003
@@ -71,10 +69,6 @@ _LEAST_CHANGES = 2
 or of the map dominates the slope."""
 _MOST_STEPS = 0.3
 """Maximum share of height readings classified as floor steps; furniture causes fewer."""
-_MOST_LOCAL_SIGMA = 0.15
-"""Maximum relative standard deviation of a local scale."""
-_LEAST_LOCAL_SIGMA = 0.03
-"""Lower bound of the standard deviation: drift within the window."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,37 +357,3 @@ def _evidence(
         tilt_rad,
         aged,
     )
-
-
-def scale_of(
-    moved: Displacements,
-    track: TelemetryTrack,
-    delay_s: float,
-    R_w_m: FloatArray,
-    T_b_c: FloatArray,
-    config: FusionConfig,
-    shortfall_m_s: float = 0.0,
-) -> ScaleEstimate | None:
-    """Metres per map unit along some displacements; None where velocities do not determine it.
-
-    Args:
-        moved: Visual displacements, by the stamps of frames.
-        track: Telemetry of the flight.
-        delay_s: Video delay behind telemetry.
-        R_w_m: Map axes to telemetry's world ``(3, 3)``.
-        T_b_c: Camera to body ``(4, 4)`` [m].
-        config: Noise of velocities, and the minimum speed.
-        shortfall_m_s: Expected truncation loss of every non-zero velocity.
-    """
-    moved = in_common(moved, track, delay_s)
-    if not len(moved):
-        return None
-    reported = camera_moved(moved, track, T_b_c[:3, 3], shortfall_m_s)
-    moving = np.linalg.norm(reported, axis=1) > MIN_SPEED_M_S * moved.duration_s
-    moved, reported = moved.only(moving), reported[moving]
-    tilt = MOUNT_RAD
-    evidence = _evidence(moved, reported, R_w_m, tilt)
-    found = None if evidence is None else evidence.belief("telemetry", tilt, 0.0)
-    if found is None or found.sigma > _MOST_LOCAL_SIGMA:
-        return None
-    return replace(found, sigma=max(found.sigma, _LEAST_LOCAL_SIGMA)).estimate

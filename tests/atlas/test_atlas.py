@@ -63,9 +63,8 @@ class Pieces:
         for keyframe in self.keyframes:
             self.log.append(keyframe.frame_index, keyframe.stamp_s, keyframe.id, keyframe.T_c_w, True)
 
-    def atlas(self, start_sigma=np.inf, **told):
-        told = {"scale_now": lambda: ScaleEstimate(2.0, 0.02, "telemetry")} | told
-        graph = SubmapGraph(self.map, self.log, **told)
+    def atlas(self, start_sigma=np.inf):
+        graph = SubmapGraph(self.map, self.log, lambda: ScaleEstimate(2.0, 0.02, "telemetry"))
         graph.begin(1, self.keyframes[4], start_sigma, 0.01)
         return Atlas(self.tracker, self.edges, graph, LmConfig(diagnostics=False))
 
@@ -282,75 +281,8 @@ def test_predicted_depths_give_no_scale(rng, guessed_there):
     assert len(log_ratios(pieces.tracker, keyframe, track)) == 0
 
 
-CARRIED = sim3.exp(np.array([0.02, -0.03, 0.01, 0.01, -0.02, 0.02, np.log(1.06)]))
-"""The same of a piece that began where the drone's sensors had carried the camera."""
-
-
-def turning(rng, misplaced):
-    """A second piece whose depths are all the network's: the drone has turned on the spot."""
-    pieces = Pieces(rng, misplaced=misplaced)
-    anchors, host = pieces.map.anchors, pieces.keyframes[4]
-    ids = pieces.map.anchors_seen_by(pieces.keyframes[4:])
-    inverse_depth = 1.0 / se3.transform(host.T_c_w, anchors.p_w[ids])[:, 2]
-    anchors.from_depth[ids] = True
-    anchors.rest_on_prior(ids, host.id, host.centre_w, np.column_stack([inverse_depth, 0.05 * inverse_depth]))
-    return pieces
-
-
-def metres_along(second):
-    """Metres per unit of either piece, by the stamps of its frames: 2 of the first, to 2 %."""
-
-    def told(stamps_s, T_w_c):
-        value = 2.0 if len(stamps_s) and stamps_s[0] == 0.0 else second
-        return ScaleEstimate(value, 0.02 * value, "telemetry")
-
-    return told
-
-
-def test_sensors_give_the_scale_if_images_do_not(rng):
-    pieces = turning(rng, CARRIED)
-    keyframe, other = pieces.keyframes[4], pieces.keyframes[3]
-    assert link(pieces.tracker, keyframe, other) is None
-    found = link(pieces.tracker, keyframe, other, scale_between=lambda: (1 / 1.06, 0.03))
-    error = sim3.log(found.S @ CARRIED)
-    assert np.abs(error[:6]).max() < 0.03 and abs(error[6]) < 0.001
-    assert (found.by_images, found.sigma_log) == (False, 0.03)
-    assert link(pieces.tracker, keyframe, other, scale_between=lambda: None) is None
-
-
-def test_wallpaper_gives_no_scale(rng, monkeypatch):
-    pieces = turning(rng, CARRIED)
-    place = links._place
-    monkeypatch.setattr(links, "_place", lambda *args: replace(place(*args), share=0.16))
-    monkeypatch.setattr(links, "on_one_plane", lambda *_: False)
-    assert (
-        link(pieces.tracker, pieces.keyframes[4], pieces.keyframes[3], scale_between=lambda: (1 / 1.06, 0.03)) is None
-    )
-
-
-def test_a_submap_of_a_rotation_is_merged_with_the_first_one(rng):
-    assert turning(rng, CARRIED).atlas().update() is None
-    pieces = turning(rng, CARRIED)
-    assert pieces.atlas(metres_along=metres_along(2.0 / 1.06)).update() is None, "nothing says where it began"
-    join = pieces.atlas(metres_along=metres_along(2.0 / 1.06), start_sigma=0.01).update()
-    assert join.growth(7) / join.growth(0) == pytest.approx(1 / 1.06, rel=0.02)
-    check_map(pieces.map)
-    assert pieces.position_error() < 0.02
-
-
-@pytest.mark.parametrize("by_sensors", [True, False])
-def test_drift_of_the_older_submap_is_distributed_over_it(rng, by_sensors):
-    """The newer one began where the drone's sensors had carried it: a step between them would be torn by telemetry."""
-    pieces = Pieces(rng, misplaced=CARRIED)
-    join = pieces.atlas(start_sigma=0.01 if by_sensors else np.inf).update()
-    assert len(join.scale_change) == (8 if by_sensors else 4)
-    assert pieces.position_error() < 0.02
-
-
 def test_an_unreachable_submap_is_not_merged(rng):
     """Half a metre and forty degrees off after a way of centimetres: nothing drifts so, however much it looks alike."""
-    told = metres_along(2.0 / 1.4)
-    assert turning(rng, MISPLACED).atlas(metres_along=told, start_sigma=0.01).update() is None
     assert Pieces(rng, misplaced=MISPLACED).atlas(start_sigma=0.01).update() is None
     assert Pieces(rng, misplaced=MISPLACED).atlas().update() is not None, "by images alone"
 

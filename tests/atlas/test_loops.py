@@ -40,6 +40,9 @@ def camera_at(angle):
     return se3.inverse(T_w_c)
 
 
+METRIC, UNKNOWN = ScaleEstimate(1.0, 0.02, "telemetry"), ScaleEstimate()
+
+
 class Ring:
     """Points on a wall around, and keyframes that see it; an anchor for every point and every time that it is passed.
 
@@ -100,8 +103,8 @@ class Ring:
     def moved(self, k):
         return sim3.exp(np.multiply.outer(k, self.drift))
 
-    def graph(self, along=lambda *_: None):
-        return SubmapGraph(self.map, self.log, metres_along=along)
+    def graph(self, metres=UNKNOWN):
+        return SubmapGraph(self.map, self.log, lambda: metres)
 
     def atlas(self, closing=True, **told):
         return Atlas(self.tracker, self.edges, self.graph(**told), LmConfig(diagnostics=False), closing)
@@ -252,12 +255,12 @@ def test_a_loop_beyond_the_drift_allowed_by_telemetry_is_rejected(rng):
     """A metre off on a way of 12 m, while the drone turns on the spot and nothing tells metres at that moment."""
     far = 4.0 * DRIFT * [1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]
     for drift, telemetry, closes in [
-        (far, None, True),
-        (far, ScaleEstimate(1.0, 0.02), False),
-        (DRIFT, ScaleEstimate(1.0, 0.02), True),
+        (far, UNKNOWN, True),
+        (far, METRIC, False),
+        (DRIFT, METRIC, True),
     ]:
         ring = Ring(rng, drift=drift)
-        assert bool(closed(ring, ring.atlas(along=lambda *_, told=telemetry: told))) == closes
+        assert bool(closed(ring, ring.atlas(metres=telemetry))) == closes
 
 
 def test_the_allowed_scale_drift_grows_with_the_path(rng):
@@ -282,10 +285,9 @@ def test_the_shortest_covisibility_path_bounds_the_drift(rng):
     off = np.eye(4)
     off[:3, 3] = 1.0 * beside.keyframe.T_c_w[0, :3]  # along the wall
     alike = replace(beside, S=off @ beside.S)
-    metric = lambda *_: ScaleEstimate(1.0, 0.02)  # noqa: E731
     assert ring.allows(beside) and ring.allows(alike)
-    assert ring.allows(beside, along=metric)
-    assert not ring.allows(alike, along=metric), "a map whose metres are known drifts less"
+    assert ring.allows(beside, metres=METRIC)
+    assert not ring.allows(alike, metres=METRIC), "a map whose metres are known drifts less"
     share_anchors(ring.map, [found])
     assert ring.allows(beside)
     assert not ring.allows(alike)

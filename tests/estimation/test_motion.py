@@ -89,7 +89,6 @@ def test_nothing_is_known_before_motion_or_telemetry(swinging):
         fusion.add_visual(float(t), T, 0.003, 0.002)
     assert fusion.scale().units is Units.ARBITRARY
     assert fusion.orientation.R_w_m is None
-    assert fusion.scale_along(motion.stamps_s, motion.T_w_c) is None
 
 
 def test_gravity_is_there_with_the_first_frame(rng, swinging):
@@ -213,25 +212,6 @@ def test_while_flying_the_scale_is_the_present_one(fused, swinging, replay):
         z.append(z_of(fusion.scale(), gauge))
     assert np.mean(off) < 0.5 * 0.3 * 4.0 / 14.0  # the mean over the way would be off by twice that
     assert np.max(np.abs(z)) < 2.5
-
-
-@pytest.mark.parametrize(("change", "low_m_s"), [(lambda v: v, 0.0), (lambda v: 0.1 * np.trunc(10.0 * v), 0.05)])
-def test_some_frames_of_a_flight_have_a_scale_of_their_own(fused, swinging, change, low_m_s):
-    """Whatever is remembered of them: a piece of map may be older than the displacements that are kept. A drone that
-    truncates reads half a step low."""
-    motion = swinging(34.0, 12.0)
-    config = FusionConfig(delay_s=0.0, velocity_rounding="truncate" if low_m_s else "nearest")
-    spoil = lambda s: replace(s, velocity_m_s=change(s.velocity_m_s + low_m_s * np.sin(50.0 * s.stamp_s)))  # noqa: E731
-    fusion, _ = fused(motion, EXACT, config, change=spoil)
-    early = motion.stamps_s < 11.0
-    T_m_c = fusion.orientation.R_w_m.T @ motion.T_w_c[early, :3, :3]
-    T = motion.T_w_c[early].copy()
-    T[:, :3, :3], T[:, :3, 3] = T_m_c, T[:, :3, 3] @ fusion.orientation.R_w_m / 0.7
-    told = fusion.scale_along(motion.stamps_s[early], T)
-    assert told.value == pytest.approx(0.7, rel=0.05)
-    assert abs(told.value - 0.7) < 3.0 * told.sigma
-    assert fusion.scale_along(motion.stamps_s[:0], T[:0]) is None
-    assert fusion.scale_along(motion.stamps_s[early] + 1e3, T) is None
 
 
 def test_hovering_holds_the_scale(rng, fused, swinging):

@@ -59,7 +59,7 @@ class Flown:
             poses=lambda: (np.zeros(2), np.stack([np.eye(4)] * 2)),
         )
         metres = ScaleEstimate(1.0, 0.02, "telemetry")
-        graph = SubmapGraph(slam_map, log, lambda: metres, lambda *_: metres)
+        graph = SubmapGraph(slam_map, log, lambda: metres)
         graph.begin(1, self.keyframes[5], self.between, 0.0)
         return SimpleNamespace(
             map=slam_map,
