@@ -1,9 +1,9 @@
 """Fusion of map and telemetry: metric scale, gravity, video delay, and pose prediction without vision.
 
-`MotionFusion` receives frames and messages and delegates to its parts: `remembered` (messages, poses, delay, gates),
-`orientation` (map and camera in the drone's world), `scale_estimator` (the scale and its sources), `comparison`
-(validation of telemetry), `telemetry_scale` and `filter_feed`. Reading a result computes nothing: each
-tracked frame may trigger a fit, whose results are valid until the next.
+`MotionFusion` receives frames and messages and delegates to its parts: `telemetry/remembered` (messages, poses, delay,
+gates), `orientation` (map and camera in the drone's world), `scale_estimator` (the scale and its sources),
+`telemetry/comparison` (validation of telemetry), `telemetry_scale` and `filter_feed`. Reading a result computes
+nothing: each tracked frame may trigger a fit, whose results are valid until the next.
 """
 
 import math
@@ -18,14 +18,14 @@ from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.estimation.filter.filter_feed import FilterFeed, PoseEstimate
 from edgeslam_torch.estimation.orientation import Orientation
 from edgeslam_torch.estimation.output_frame import OutputFrame
-from edgeslam_torch.estimation.remembered import Remembered
 from edgeslam_torch.estimation.scale.belief import disagreement
 from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
 from edgeslam_torch.estimation.sensors.imu import REACH_S as IMU_REACH_S
 from edgeslam_torch.estimation.sensors.imu import Imu
 from edgeslam_torch.estimation.snapshot import Present, Snapshot
-from edgeslam_torch.estimation.telemetry.comparison import Comparison, FlightSoFar
+from edgeslam_torch.estimation.telemetry.comparison import Comparison
 from edgeslam_torch.estimation.telemetry.delay import DelaySearch
+from edgeslam_torch.estimation.telemetry.remembered import Remembered
 from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, SensorGate
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory, VisualPose
@@ -71,7 +71,7 @@ class MotionFusion:
         self.orientation = Orientation(self.flight, given)
         self.metres = ScaleEstimator(config, focal_sigma)
         self.imu = Imu(ImuModel() if imu is None else imu)
-        self._comparison = Comparison(config)
+        self._comparison = Comparison(self.flight)
         self._filter = FilterFeed(config, given)
         self._fitted_s = -math.inf
         """Stamp of the last fit."""
@@ -346,11 +346,9 @@ class MotionFusion:
         if turned is None:
             return
         orientation.found = turned
-        present = FlightSoFar(self._memory, self._track, orientation.T_b_c, metres.rough(), metres.network())
-        self._comparison.judge(self._trust, present, self.flight.delay.delay, turned.R_w_m, flying)
-        scale = TelemetryScale(
-            self.config, orientation.T_b_c, present, self._trust, self.delay_s, turned, metres.previous_scale(), flying
-        )
+        T_b_c, rough = orientation.T_b_c, metres.rough()
+        self._comparison.judge(T_b_c, turned.R_w_m, rough, flying)
+        scale = TelemetryScale(self.flight, T_b_c, turned, rough, metres.network(), metres.previous_scale(), flying)
         metres.take(*scale.beliefs(), self._trust)
 
     def _search_delay(self) -> None:

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from edgeslam_torch.estimation.remembered import Remembered
 from edgeslam_torch.estimation.scale.camera_mount import Turned, mount_by_turns
 from edgeslam_torch.estimation.sensors.attitude import is_steady
 from edgeslam_torch.estimation.telemetry.alignment import LATELY, attitudes
 from edgeslam_torch.estimation.telemetry.comparison import MAX_DEVIATION_RAD
+from edgeslam_torch.estimation.telemetry.remembered import Remembered
 from edgeslam_torch.geometry.rotations import rotation_vector
 from edgeslam_torch.noise import DELAY_S, MOUNT_RAD
 from edgeslam_torch.types import FloatArray

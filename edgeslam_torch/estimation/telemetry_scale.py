@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.estimation.config import MAX_GAP_S, MIN_SPEED_M_S, FusionConfig
+from edgeslam_torch.estimation.config import MAX_GAP_S, MIN_SPEED_M_S
 from edgeslam_torch.estimation.scale.belief import ScaleBelief, contradict
 from edgeslam_torch.estimation.scale.camera_mount import Turned
 from edgeslam_torch.estimation.scale.evidence import (
@@ -27,10 +27,9 @@ from edgeslam_torch.estimation.sensors.velocity import (
     seen_velocity,
 )
 from edgeslam_torch.estimation.telemetry.alignment import camera_moved, in_common
-from edgeslam_torch.estimation.telemetry.comparison import FlightSoFar
+from edgeslam_torch.estimation.telemetry.remembered import Remembered
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
     Reading,
-    SensorGate,
     agreement,
     changes,
 )
@@ -124,33 +123,31 @@ class TelemetryScale:
     """Scale from displacements and heights at one moment; updates the height verdicts of `SensorGate`.
 
     Args:
-        config: Settings.
+        flight: Visual poses and telemetry so far, and which readings are usable.
         T_b_c: Camera in the body ``(4, 4)`` [m].
-        present: Visual poses and telemetry so far.
-        trust: Which readings are usable.
-        delay_s: Video delay behind telemetry.
         turned: Rotation of the map relative to the power-on world.
+        rough: Metres per map unit, if roughly known.
+        network: Scale by the depth network, which decides between contradictory velocities and heights.
         previous: Previous scale [metres per map unit].
         flying: Estimate the present scale of a drifting map; otherwise one scale for the whole map.
     """
 
     def __init__(
         self,
-        config: FusionConfig,
+        flight: Remembered,
         T_b_c: FloatArray,
-        present: FlightSoFar,
-        trust: SensorGate,
-        delay_s: float,
         turned: Turned,
+        rough: float | None,
+        network: ScaleBelief | None,
         previous: float | None,
         flying: bool = False,
     ) -> None:
-        self._config, self._T_b_c = config, T_b_c
-        self._present, self._trust = present, trust
-        self._delay_s, self._previous = delay_s, previous
+        self._flight, self._T_b_c = flight, T_b_c
+        self._config, self._trust, self._delay_s = flight.config, flight.trust, flight.delay_s
+        self._rough, self._network, self._previous = rough, network, previous
         self._R_w_m, self._tilt_rad = turned.R_w_m, turned.sigma_rad
         self._flying = flying
-        self._shown = self._compared() if trust.velocity else None
+        self._shown = self._compared() if self._trust.velocity else None
 
     def beliefs(self) -> tuple[dict[str, ScaleBelief] | None, TelemetryFit | None]:
         """Scale by velocities (``telemetry``) and by ``height``, each alone, None in hover, and details of the fit.
@@ -160,7 +157,7 @@ class TelemetryScale:
         """
         config = self._config
         fixed = {"nearest": Rounding.NEAREST, "truncate": Rounding.TRUNCATE}.get(config.velocity_rounding)
-        sweeps = 0.0 if fixed else self._present.track.truncation_log_odds(config.velocity_step_m_s)
+        sweeps = 0.0 if fixed else self._flight.track.truncation_log_odds(config.velocity_step_m_s)
         tried = tuple(Rounding) if fixed is None else (fixed,)
         moved = {r: e for r in tried if (e := self._by_displacements(r)) is not None}
         compared = len(moved) == len(tried)  # the rounding modes compare only if both have displacements
@@ -201,7 +198,7 @@ class TelemetryScale:
 
     def _height_alone(self, velocity: ScaleBelief | None, moved: Evidence | None) -> ScaleBelief | None:
         """Scale by heights; floor steps are found with the scale by velocities, unless the network contradicts it."""
-        network, known = self._present.network, self._present.rough_scale
+        network, known = self._network, self._rough
         rough = None if velocity is None else velocity.estimate.value
         if rough is None or (velocity is not None and network is not None and contradict(velocity, network)):
             rough = self._shown.start if known is None and self._shown is not None else known
@@ -243,14 +240,14 @@ class TelemetryScale:
     def _aged(self, stamps_s: FloatArray) -> FloatArray | None:
         """Log age of the map since each time ``(N,)`` of telemetry's clock, see `aged_since`; None if drift is not
         modelled."""
-        memory = self._present.memory
+        memory = self._flight.memory
         if not self._flying or memory.last is None:
             return None
         return aged_since(stamps_s + self._delay_s, memory.began_s, memory.last.stamp_s)
 
     def _compared(self) -> _Shown | None:
         """Intervals in which the drone moves."""
-        track, memory = self._present.track, self._present.memory
+        track, memory = self._flight.track, self._flight.memory
         moved = memory.displacements()
         moved = in_common(moved, track, self._delay_s).joined()
         if len(moved) < 2:
@@ -277,14 +274,14 @@ class TelemetryScale:
 
     def _by_height(self, scale: float, moved: Evidence | None) -> Evidence | None:
         """Evidence from the most accurate of range sensor, SDK height and barometer: they observe the same motion."""
-        seen = self._present.memory.sightings()
+        seen = self._flight.memory.sightings()
         stamps_s = seen.stamps_s - self._delay_s
         lever = -seen.T[:, :3, :3] @ (self._T_b_c[:3, :3].T @ self._T_b_c[:3, 3])  # from camera to body [m]
         p_w = (seen.T[:, :3, 3] + lever / scale) @ self._R_w_m.T
         vertical_c = np.einsum("w,nwc->nc", self._R_w_m[2], seen.T[:, :3, :3])
         sigma_map = float(np.median(seen.sigma_t))
         best, best_sigma = None, math.inf
-        for name, (times, z) in self._present.track.heights().items():
+        for name, (times, z) in self._flight.track.heights().items():
             if len(times) < 2:
                 continue
             # Interpolate poses at readings, not readings at poses: each reading counts once.

@@ -93,14 +93,11 @@ def _replay(
             fusion.scale()
 
 
-def _at_once(
-    fusion: MotionFusion, motion: Motion, gauge: Gauge, telemetry: Sequence[TelemetrySample], passes: int = 1
-) -> None:
+def _at_once(fusion: MotionFusion, motion: Motion, gauge: Gauge, telemetry: Sequence[TelemetrySample]) -> None:
     """Give a whole flight, in its map as it is at last: one fit instead of one a second."""
     fusion.add_telemetry(telemetry)
     fusion.add_earlier(motion.stamps_s, gauge.T_m_c, gauge.sigma_t, gauge.sigma_r)
-    for _ in range(passes):
-        fusion.revise(motion.stamps_s, gauge.T_m_c)
+    fusion.revise(motion.stamps_s, gauge.T_m_c)
 
 
 @pytest.fixture(scope="session")

@@ -361,12 +361,12 @@ def test_velocities_in_the_wrong_unit_are_named_and_the_scale_covers_them(told_o
 
 
 @pytest.mark.parametrize("random", [True, False])
-def test_heights_that_do_not_climb_with_the_images_are_not_used(told_of, swinging, random):
+def test_heights_that_do_not_climb_with_the_images_are_not_used(told_of, swinging, replay, random):
     def spoil(rng, samples, motion):
         z = rng.uniform(0.3, 2.0, len(samples)) if random else np.ones(len(samples))
         return [replace(s, tof_m=x, height_m=x, baro_m=x) for s, x in zip(samples, z.tolist(), strict=True)]
 
-    _, fusion, gauge = told_of(swinging(18.0, size_m=0.5), spoil, passes=2)  # the first one finds the delay
+    _, fusion, gauge = told_of(swinging(18.0, 10.0, size_m=0.5), spoil, replay)
     assert "height" not in fusion.scale().source
     assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.06)  # the velocities are right
     assert any("height (tof) is not used" in w for w in fusion.warnings())

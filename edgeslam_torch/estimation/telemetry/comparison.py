@@ -1,12 +1,11 @@
 """Comparison of velocities and attitude with the images, at the current delay and at others."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from edgeslam_torch.estimation.config import MIN_SPEED_M_S, FusionConfig
-from edgeslam_torch.estimation.scale.belief import ScaleBelief
+from edgeslam_torch.estimation.config import MIN_SPEED_M_S
 from edgeslam_torch.estimation.telemetry.alignment import (
     Attitudes,
     attitude_deviation,
@@ -17,6 +16,7 @@ from edgeslam_torch.estimation.telemetry.alignment import (
     turns,
 )
 from edgeslam_torch.estimation.telemetry.delay import GROWTH, Delay
+from edgeslam_torch.estimation.telemetry.remembered import Remembered
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
     ATTITUDE,
     SURELY_WRONG,
@@ -24,13 +24,11 @@ from edgeslam_torch.estimation.telemetry.sensor_validation import (
     Agreement,
     Reading,
     Reread,
-    SensorGate,
     Verdict,
     agreement,
     wrong_columns,
 )
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack, Turn
-from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory
 from edgeslam_torch.geometry.rotations import vectors_from_matrices
 from edgeslam_torch.noise import MOUNT_RAD
 from edgeslam_torch.types import FloatArray
@@ -56,121 +54,116 @@ rotation, a sign error by twice that."""
 _DELAY_STEP_S = 0.1
 
 
-@dataclass(frozen=True, slots=True)
-class FlightSoFar:
-    """Inputs of a comparison."""
-
-    memory: VisualMemory
-    track: TelemetryTrack
-    T_b_c: FloatArray
-    """Camera in the body ``(4, 4)`` [m]."""
-    rough_scale: float | None
-    """Metres per map unit, for what counts as motion."""
-    network: ScaleBelief | None = None
-    """Scale by the depth network, which decides between contradictory velocities and heights."""
-
-
 class Comparison:
     """Updates `SensorGate` with verdicts on velocities and attitude; records when other delays were last tested."""
 
-    def __init__(self, config: FusionConfig) -> None:
-        self._config = config
+    def __init__(self, flight: Remembered) -> None:
+        self._flight = flight
         self._looked_wide_at = 0
+        self._T_b_c: FloatArray = np.eye(4)
+        self._least_seen = math.inf
+        """Speed [map units/s] above which the images show motion."""
 
-    def judge(
-        self, trust: SensorGate, present: FlightSoFar, delay: Delay, R_w_m: FloatArray, flying: bool = False
-    ) -> None:
+    def judge(self, T_b_c: FloatArray, R_w_m: FloatArray, rough_scale: float | None, flying: bool = False) -> None:
         """Compare at the current delay, in other frames and, if the fit is poor, at other delays.
 
         Velocities that fit significantly better in another frame are interpreted in that frame from now on, overriding
         settings and reader. A good fit does not prove the frame: a camera that leans without turning correlates by 80
         to 90 % with velocities in body axes. While ``flying`` the tests are repeated only as data grow.
+
+        Args:
+            T_b_c: Camera in the body ``(4, 4)`` [m].
+            R_w_m: Map axes to the power-on world ``(3, 3)``.
+            rough_scale: Metres per map unit, for what counts as motion.
+            flying: Whether the flight goes on.
         """
-        attitude = self._attitude(present, delay)
+        self._T_b_c = T_b_c
+        self._least_seen = math.inf if rough_scale is None else 2.0 * MIN_SPEED_M_S / rough_scale
+        flight = self._flight
+        trust, track, delay = flight.trust, flight.track, flight.delay.delay
+        attitude = self._attitude(delay)
         if attitude is not None:
             trust.judge(Reading.ATTITUDE, attitude)
-        now, n = self._velocity(present, delay.value_s, R_w_m), present.memory.count
+        now, n = self._velocity(track, delay.value_s, R_w_m), flight.memory.count
         grown = not flying or n >= GROWTH * self._looked_wide_at
         look = now.count >= _TO_LOOK_ELSEWHERE and grown
         if look:
             self._looked_wide_at = n
-            turn = self._fits_turned(present, now, delay.value_s, R_w_m) if trust.attitude else None
+            turn = self._fits_turned(now, delay.value_s, R_w_m) if trust.attitude else None
             if turn is not None:
                 trust.reread = Reread(turn, now)
-                present.track.read_as(turn)
-                now = self._velocity(present, delay.value_s, R_w_m)
+                track.read_as(turn)
+                now = self._velocity(track, delay.value_s, R_w_m)
                 trust.forget(Reading.VELOCITY)
         if not math.isfinite(delay.sigma_s):  # at a wrong delay every column shows another motion
             now = replace(now, broken=())
         if now.correlation >= _FITS_WELL:
             trust.elsewhere_s = None
         elif look:
-            trust.elsewhere_s = self._fits_elsewhere(present, now, delay.value_s)
+            trust.elsewhere_s = self._fits_elsewhere(now, delay.value_s)
         trust.judge(Reading.VELOCITY, now)
 
-    def _fits_turned(self, present: FlightSoFar, now: Agreement, delay_s: float, R_w_m: FloatArray) -> Turn | None:
+    def _fits_turned(self, now: Agreement, delay_s: float, R_w_m: FloatArray) -> Turn | None:
         """The velocity frame that fits significantly better than the current one, if any."""
         best, best_turn = now, None
-        for turn in present.track.other_turns:
-            other = replace(present, track=present.track.as_if(turn))
-            found = self._velocity(other, delay_s, R_w_m)
+        for turn in self._flight.track.other_turns:
+            found = self._velocity(self._flight.track.as_if(turn), delay_s, R_w_m)
             if found.correlation > best.correlation:
                 best, best_turn = found, turn
         return best_turn if _surely_better(best, now) else None
 
-    def _fits_elsewhere(self, present: FlightSoFar, now: Agreement, used_s: float) -> float | None:
+    def _fits_elsewhere(self, now: Agreement, used_s: float) -> float | None:
         """The best-fitting delay, if it is significantly better than the current one and not allowed."""
-        fixed = self._config.delay_s
-        low, high = self._config.delay_range_s if fixed is None else (fixed - _FIXED_REACH_S, fixed + _FIXED_REACH_S)
+        config, track = self._flight.config, self._flight.track
+        fixed = config.delay_s
+        low, high = config.delay_range_s if fixed is None else (fixed - _FIXED_REACH_S, fixed + _FIXED_REACH_S)
         best, best_s = now, used_s
         for delay_s in np.arange(_WIDE_DELAYS_S[0], _WIDE_DELAYS_S[1] + 1e-9, _WIDE_STEP_S).tolist():
-            R = map_to_world(present.memory.sightings(), present.track, delay_s, present.T_b_c[:3, :3])
-            found = None if R is None else self._velocity(present, delay_s, R)
+            R = map_to_world(self._flight.memory.sightings(), track, delay_s, self._T_b_c[:3, :3])
+            found = None if R is None else self._velocity(track, delay_s, R)
             if found is not None and found.count >= now.count // 2 and found.correlation > best.correlation:
                 best, best_s = found, delay_s
         return best_s if _surely_better(best, now) and not low <= best_s <= high else None
 
-    def _velocity(self, present: FlightSoFar, delay_s: float, R_w_m: FloatArray) -> Agreement:
+    def _velocity(self, track: TelemetryTrack, delay_s: float, R_w_m: FloatArray) -> Agreement:
         """Agreement of velocities with the images at one delay.
 
         The camera's lever arm is left out of the correlation, for which rotations must not count as evidence.
         """
-        track = present.track
-        moved = in_common(present.memory.displacements(), track, delay_s)
+        moved = in_common(self._flight.memory.displacements(), track, delay_s)
         if len(moved) == 0:
             return Agreement()
         duration = moved.duration_s[:, None]
-        reported, at_camera = (camera_moved(moved, track, arm) for arm in (np.zeros(3), present.T_b_c[:3, 3]))
-        slow = MIN_SPEED_M_S
-        least_seen = math.inf if present.rough_scale is None else 2.0 * slow / present.rough_scale
+        reported, at_camera = (camera_moved(moved, track, arm) for arm in (np.zeros(3), self._T_b_c[:3, 3]))
         seen, reported = moved.moved @ R_w_m.T / duration, reported / duration
-        found = agreement(seen, reported, least_seen, slow, early=True)
+        found = agreement(seen, reported, self._least_seen, MIN_SPEED_M_S, early=True)
         R_w = track.axes()[np.searchsorted(track.readings.stamp_s, 0.5 * (moved.from_s + moved.to_s))]
         wrong = wrong_columns(*(np.einsum("nwa,nw->na", R_w, v) for v in (seen, at_camera / duration)))
         broken = tuple(name for name, share in zip(VELOCITY, wrong, strict=True) if share > SURELY_WRONG)
         return replace(found, broken=broken, wrong=wrong)
 
-    def _attitude(self, present: FlightSoFar, delay: Delay) -> Agreement | None:
+    def _attitude(self, delay: Delay) -> Agreement | None:
         """Agreement of attitude with the images; None without common intervals."""
-        moved = in_common(present.memory.displacements(), present.track, delay.value_s)
+        track = self._flight.track
+        moved = in_common(self._flight.memory.displacements(), track, delay.value_s)
         if len(moved) == 0:
             return None
-        both = turns(moved, present.track, present.T_b_c[:3, :3])
+        both = turns(moved, track, self._T_b_c[:3, :3])
         seen, reported = (vectors_from_matrices(R) / moved.duration_s[:, None] for R in (both.seen, both.reported))
         found = agreement(seen, reported, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
-        return replace(found, broken=self._broken_attitude(present, delay))
+        return replace(found, broken=self._broken_attitude(delay))
 
-    def _broken_attitude(self, present: FlightSoFar, delay: Delay) -> tuple[str, ...]:
+    def _broken_attitude(self, delay: Delay) -> tuple[str, ...]:
         """Attitude columns that contradict the images at the known delay, or at all possible ones."""
-        known, sightings = math.isfinite(delay.sigma_s), present.memory.sightings()
-        low, high = self._config.delay_range_s
+        known, flight = math.isfinite(delay.sigma_s), self._flight
+        low, high = flight.config.delay_range_s
         delays_s = [delay.value_s] if known else np.arange(low, high + 1e-9, _DELAY_STEP_S).tolist()
         ratios = []
         for delay_s in delays_s:
-            reported = attitudes(sightings, present.track, delay_s)
+            reported = attitudes(flight.memory.sightings(), flight.track, delay_s)
             if reported is not None and len(reported.stamp_s) >= _FEW_ATTITUDES:
                 ratios.append(
-                    self._relative_deviation(reported, present.T_b_c[:3, :3], delay.sigma_s if known else _DELAY_STEP_S)
+                    self._relative_deviation(reported, self._T_b_c[:3, :3], delay.sigma_s if known else _DELAY_STEP_S)
                 )
         if not ratios:
             return ()
