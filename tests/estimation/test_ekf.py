@@ -44,7 +44,7 @@ def test_literal_process_noise_is_paper_equation_10_by_hand():
     ekf = Ekf(config)
     ekf.P[:] = 0.0
     ekf.predict(0.1, np.zeros(3), battery=0.6)  # beta (1 - b + lambda tau) = 0.01 (0.4 + 0.05)
-    np.testing.assert_allclose(ekf.state(0.1).covariance, 0.0045 * np.eye(6), atol=1e-15)
+    np.testing.assert_allclose(ekf.covariance, 0.0045 * np.eye(6), atol=1e-15)
 
 
 def test_process_noise_grows_with_time_step_spent_battery_and_blind_time():
@@ -74,7 +74,7 @@ def test_exact_relative_poses_lead_along_the_true_path(rng, monkeypatch):
         truth = truth @ step
         ekf.update_relative(step, 1e-4, 1e-4)
         ekf.clone()
-    state = ekf.state(6.0)
+    state = ekf
     assert np.linalg.norm(state.p_w - truth[:3, 3]) < 0.01
     assert np.linalg.norm(rotation_vector(matrix_from_rpy(state.rpy_rad).T @ truth[:3, :3])) < 0.01
 
@@ -110,7 +110,7 @@ def test_gate_is_the_95_percent_quantile(degrees, share, outcome):
     """One attitude, or one pose, whose innovation is a little within or a little beyond that ellipsoid."""
     ekf = Ekf(CONFIG)
     ekf.predict(0.5, np.zeros(3))
-    P = ekf.state(0.0).covariance
+    P = ekf.covariance
     if degrees == 3:
         sigma = math.sqrt(P[3, 3] + ATTITUDE_RAD**2)
         told = ekf.update_attitude(np.array([math.sqrt(share * CHI2_95[3]) * sigma, 0.0, 0.0]))
@@ -158,7 +158,7 @@ def test_velocity_moves_the_position_as_paper_equation_9_says(frame, moved):
     ekf = Ekf(FusionConfig(velocity_frame=frame))
     ekf.reset_pose(np.zeros(3), np.array([0.0, 0.0, math.pi / 2]))
     ekf.predict(0.5, np.array([1.0, 0.0, 0.2]))
-    np.testing.assert_allclose(ekf.state(0.5).p_w, moved, atol=1e-12)
+    np.testing.assert_allclose(ekf.p_w, moved, atol=1e-12)
 
 
 @pytest.mark.parametrize(("literal", "off_rad"), [(False, 0.02), (True, math.pi)])
@@ -166,7 +166,7 @@ def test_angle_innovation_wraps_across_pi_but_for_the_printed_filter(literal, of
     ekf = Ekf(FusionConfig(literal=literal))
     ekf.reset_pose(np.zeros(3), np.array([0.0, 0.0, math.pi - 0.01]))
     assert ekf.update_attitude(np.array([0.0, 0.0, -math.pi + 0.01])) is Outcome.ACCEPTED
-    off = abs(wrapped(ekf.state(0.0).rpy_rad[2] - math.pi))
+    off = abs(wrapped(ekf.rpy_rad[2] - math.pi))
     assert off < 0.02 if not literal else 0.5 < off < off_rad
 
 
@@ -180,4 +180,4 @@ def test_gate_refuses_a_jump_and_recovers_when_it_stays():
     np.testing.assert_array_equal(ekf.x, before.x)
     np.testing.assert_array_equal(ekf.P, before.P)
     assert ekf.update_attitude(wrong) is Outcome.RECOVERED
-    assert abs(ekf.state(0.0).rpy_rad[2] - 0.8) < 0.1
+    assert abs(ekf.rpy_rad[2] - 0.8) < 0.1

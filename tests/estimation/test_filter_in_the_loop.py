@@ -1,6 +1,7 @@
 """The Kalman filter predicts the camera: for tracking, through outages, and at the present moment."""
 
 import threading
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -67,6 +68,17 @@ class Flown:
     def metric(self):
         """What `EdgeSlam` would publish, in metres of the true scale."""
         return Present(self.fusion.snapshot(), OutputFrame(self.gauge.scale), True)
+
+
+@pytest.fixture(scope="module")
+def at_15_s(swinging):
+    return Flown(np.random.default_rng(0), swinging(20.0)).run(until_s=15.0)
+
+
+@pytest.fixture
+def flown(at_15_s):
+    """A flight after 15 s; each test has its own."""
+    return deepcopy(at_15_s)
 
 
 def steps_ahead(flown, gap_s):
@@ -143,21 +155,19 @@ def test_the_printed_filter_stays_selectable_and_says_something_else(rng, swingi
     assert 1e-4 < apart < 0.5
 
 
-def test_a_map_that_is_moved_moves_the_prediction_along(rng, swinging):
+def test_a_map_that_is_moved_moves_the_prediction_along(flown):
     """A refinement shifts the newest poses although the camera has not moved."""
-    flown = Flown(rng, swinging(16.0)).run(until_s=15.0)
     before = flown.fusion.predict(15.2).T_w_c
     T = se3.exp(np.array([0.3, -0.1, 0.2, 0.1, -0.2, 0.3]))
     flown.fusion.map_moved(T)
     np.testing.assert_allclose(flown.fusion.predict(15.2).T_w_c, T @ before, atol=1e-9)
 
 
-def test_a_new_piece_of_map_is_no_motion(rng, swinging):
-    flown = Flown(rng, swinging(18.0)).run(until_s=15.0)
+def test_a_new_piece_of_map_is_no_motion(flown):
     flown.fusion.begin_piece()
     assert not flown.fusion.filtering
     leap = se3.exp(np.array([0.0, 3.0, 0.0, 0.0, 0.0, 0.0]))
-    for i in np.flatnonzero(flown.motion.stamps_s > 15.0):
+    for i in np.flatnonzero((flown.motion.stamps_s > 15.0) & (flown.motion.stamps_s < 18.0)):
         t = float(flown.motion.stamps_s[i])
         flown.fusion.add_telemetry([s for s in flown.samples if t - 0.05 < s.stamp_s <= t])
         flown.fusion.add_visual(t, leap @ flown.gauge.T_m_c[i], flown.gauge.sigma_t, flown.gauge.sigma_r)
@@ -166,9 +176,8 @@ def test_a_new_piece_of_map_is_no_motion(rng, swinging):
     assert flown.off_m(se3.inverse(leap) @ flown.fusion.predict(18.1).T_w_c, 17.95) < 0.1
 
 
-def test_telemetry_that_the_caller_holds_carries_the_present_on(rng, swinging):
+def test_telemetry_that_the_caller_holds_carries_the_present_on(flown):
     """State messages that arrived since the last step, without telling the fusion."""
-    flown = Flown(rng, swinging(20.0)).run(until_s=15.0)
     newer = [s for s in flown.samples if 15.0 < s.stamp_s <= 15.8]
     present = flown.metric()
     told = present.pose_at(15.8, newer)
@@ -178,9 +187,8 @@ def test_telemetry_that_the_caller_holds_carries_the_present_on(rng, swinging):
     assert present.pose_at(15.8).source == "visual", "telemetry ends too early"
 
 
-def test_an_answer_is_the_same_whatever_other_threads_do(rng, swinging):
+def test_an_answer_is_the_same_whatever_other_threads_do(flown):
     """One thread flies on, three ask the same snapshot."""
-    flown = Flown(rng, swinging(17.0)).run(until_s=15.0)
     present, answers = flown.metric(), []
     first = present.pose_at(15.2)
 
@@ -191,7 +199,7 @@ def test_an_answer_is_the_same_whatever_other_threads_do(rng, swinging):
     threads = [threading.Thread(target=ask) for _ in range(3)]
     for thread in threads:
         thread.start()
-    for i in np.flatnonzero(flown.motion.stamps_s > 15.0):
+    for i in np.flatnonzero((flown.motion.stamps_s > 15.0) & (flown.motion.stamps_s < 17.0)):
         t = float(flown.motion.stamps_s[i])
         flown.fusion.add_telemetry([s for s in flown.samples if t - 0.05 < s.stamp_s <= t])
         flown.fusion.add_visual(t, flown.gauge.T_m_c[i], flown.gauge.sigma_t, flown.gauge.sigma_r)
@@ -238,15 +246,15 @@ def jittery(rng, jitter_m, drift, jitter):
 
 def test_jitter_of_visual_poses_is_counted_once(rng):
     """Poses with 1 cm of jitter tell the way to a centimetre however many there are; increments would lose it."""
-    once = np.array([jittery(rng, 0.01, PoseSigma(0.0, 1e-4), PoseSigma(0.01, 1e-3)) for _ in range(40)])
-    twice = np.array([jittery(rng, 0.01, PoseSigma(0.01 * np.sqrt(2.0), 1e-3), PoseSigma()) for _ in range(40)])
+    once = np.array([jittery(rng, 0.01, PoseSigma(0.0, 1e-4), PoseSigma(0.01, 1e-3)) for _ in range(25)])
+    twice = np.array([jittery(rng, 0.01, PoseSigma(0.01 * np.sqrt(2.0), 1e-3), PoseSigma()) for _ in range(25)])
     normalised = float(np.mean((once[:, 0] / once[:, 1]) ** 2))
     assert 0.4 < normalised < 2.0
     assert np.mean(once[:, 1]) < 0.6 * np.mean(twice[:, 1])
     assert np.mean(once[:, 0] ** 2) < np.mean(twice[:, 0] ** 2)
 
 
-@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_delay_is_right_whatever_the_phase_of_the_packets(seed):
     """Frames at 20 Hz and state messages at 10 Hz in step: readings interpolated half-way are less noisy, and a search
     that does not know it prefers delays between the steps (0.36 or 0.44 s for 0.40)."""

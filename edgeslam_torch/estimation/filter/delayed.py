@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgeslam_torch.estimation.config import FusionConfig
-from edgeslam_torch.estimation.filter.ekf import Ekf, EkfState, Outcome, Relative
+from edgeslam_torch.estimation.filter.ekf import Ekf, Outcome, Relative
 from edgeslam_torch.geometry.rotations import rpy_from_matrix, wrapped
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
@@ -132,14 +132,13 @@ class BufferedEkf:
         if math.isfinite(stamp_s):
             self._insert(_Event((stamp_s, _VISUAL), placed, start=pose))
 
-    def state_at(self, stamp_s: float) -> EkfState | None:
-        """State at a stamp inside the buffer or ahead of it; ``None`` before the first event."""
-        ekf = self._at(stamp_s, self._count_until(stamp_s))
-        return None if ekf is None else ekf.state(stamp_s)
+    def state_at(self, stamp_s: float) -> Ekf | None:
+        """The filter at a stamp inside the buffer or ahead of it; ``None`` before the first event."""
+        return self._at(stamp_s, self._count_until(stamp_s))
 
     def since_visual(self, stamp_s: float) -> tuple[float, Relative] | None:
         """Stamp of the last visual pose before a stamp, and the motion of the body since; ``None`` without one."""
-        ekf = self._at(stamp_s, self._count_until(stamp_s))
+        ekf = self.state_at(stamp_s)
         return None if ekf is None or not math.isfinite(ekf.clone_s) else (ekf.clone_s, ekf.since_clone())
 
     def resumed(self) -> "BufferedEkf":
@@ -200,8 +199,8 @@ class BufferedEkf:
                 ekf.velocity = start + min(1.0, dt / reach) * (following.velocity_m_s - start)
             rate = _rate(ekf, following)
         else:
-            left_s = ekf.rpy_s + _PACKET_S - before.key[0] if math.isfinite(ekf.rpy_s) else 0.0
-            rate = ekf.rpy_rate * min(1.0, max(0.0, left_s) / dt)
+            left_s = ekf.read_s + _PACKET_S - before.key[0] if math.isfinite(ekf.read_s) else 0.0
+            rate = ekf.read_rate * min(1.0, max(0.0, left_s) / dt)
         ekf.predict(dt, 0.5 * (start + ekf.velocity), ekf.battery, rate)
         return ekf
 
@@ -210,18 +209,18 @@ def _read(ekf: Ekf, sample: TelemetrySample) -> str:
     """Apply a state message."""
     if math.isfinite(float(sample.velocity_m_s.sum())):
         ekf.velocity = sample.velocity_m_s
-    ekf.rpy_rate = _rate(ekf, sample)
+    ekf.read_rate = _rate(ekf, sample)
     if math.isfinite(sample.battery):
         ekf.battery = sample.battery
     if not math.isfinite(float(sample.rpy_rad.sum())):
         return ""
-    ekf.rpy_rad, ekf.rpy_s = sample.rpy_rad, sample.stamp_s
+    ekf.read_rpy_rad, ekf.read_s = sample.rpy_rad, sample.stamp_s
     return f"attitude {ekf.update_attitude(sample.rpy_rad).value}"
 
 
 def _rate(ekf: Ekf, sample: TelemetrySample) -> FloatArray:
     """Euler angle rates [rad/s] between the last attitude reading and this one; zero across a gap."""
-    dt = sample.stamp_s - ekf.rpy_s
+    dt = sample.stamp_s - ekf.read_s
     if not 0.0 < dt < _SILENCE_S or not math.isfinite(float(sample.rpy_rad.sum())):
         return np.zeros(3)
-    return wrapped(sample.rpy_rad - ekf.rpy_rad) / dt
+    return wrapped(sample.rpy_rad - ekf.read_rpy_rad) / dt

@@ -60,21 +60,6 @@ class Outcome(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class EkfState:
-    """Pose of the body in the power-on world with its covariance."""
-
-    stamp_s: float
-    p_w: FloatArray
-    """``(3,)`` position [m]."""
-    rpy_rad: FloatArray
-    """``(3,)`` roll, pitch, yaw."""
-    velocity_bias_m_s: FloatArray
-    """``(3,)``, in the frame of the velocity readings."""
-    covariance: FloatArray
-    """``(6, 6)`` of position [m] and angles [rad]."""
-
-
-@dataclass(frozen=True, slots=True)
 class Relative:
     """Motion of the body since the last visual update, in its axes at that time."""
 
@@ -103,12 +88,32 @@ class Ekf:
         self.velocity: FloatArray = np.zeros(3)
         self.battery = math.nan
         """Of the newest reading; the velocity is interpolated between two."""
-        self.rpy_rad: FloatArray = np.full(3, math.nan)
-        self.rpy_rate: FloatArray = np.zeros(3)
-        self.rpy_s = math.nan
+        self.read_rpy_rad: FloatArray = np.full(3, math.nan)
+        self.read_rate: FloatArray = np.zeros(3)
+        self.read_s = math.nan
         """Attitude reading, its rate against the one before [rad/s], and its stamp."""
         self.clone_s = math.nan
         """Stamp of the clone."""
+
+    @property
+    def p_w(self) -> FloatArray:
+        """Position of the body in the power-on world ``(3,)`` [m]."""
+        return self.x[_P]
+
+    @property
+    def rpy_rad(self) -> FloatArray:
+        """Its roll, pitch, yaw ``(3,)``."""
+        return self.x[_A]
+
+    @property
+    def velocity_bias_m_s(self) -> FloatArray:
+        """``(3,)``, in the frame of the velocity readings."""
+        return self.x[_B]
+
+    @property
+    def covariance(self) -> FloatArray:
+        """``(6, 6)`` of position [m] and angles [rad]."""
+        return self.P[_POSE, _POSE]
 
     def copy(self) -> "Ekf":
         """An independent copy."""
@@ -292,11 +297,6 @@ class Ekf:
             # Quantisation loss is below one step. A larger bias comes from a wrong map and must not persist after it.
             np.clip(self.x[_B], -self.config.velocity_step_m_s, self.config.velocity_step_m_s, out=self.x[_B])
         return outcome
-
-    def state(self, stamp_s: float) -> EkfState:
-        """Snapshot of the pose and its covariance."""
-        x = self.x
-        return EkfState(stamp_s, x[_P].copy(), x[_A].copy(), x[_B].copy(), self.P[_POSE, _POSE].copy())
 
 
 def _relative(x: FloatArray, T_clone_b: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -6,7 +6,6 @@ from copy import copy
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,47 +98,23 @@ class Turn(Enum):
         return matrices_from_rpy(rpy * share)
 
 
-class _Rows:
-    """Samples in one array that grows by doubling, since readings are requested after every message."""
+_COLUMNS: dict[str, int | slice] = {
+    "stamp_s": 0,
+    "velocity_m_s": slice(1, 4),
+    "rpy_rad": slice(4, 7),
+    "tof_m": 7,
+    "height_m": 8,
+    "baro_m": 9,
+    "battery": 10,
+}
+"""Of a sample's fields in the table."""
 
-    COLUMNS: ClassVar[dict[str, int | slice]] = {
-        "stamp_s": 0,
-        "velocity_m_s": slice(1, 4),
-        "rpy_rad": slice(4, 7),
-        "tof_m": 7,
-        "height_m": 8,
-        "baro_m": 9,
-        "battery": 10,
-    }
 
-    def __init__(self) -> None:
-        self._buffer, self._count = np.empty((256, 11)), 0
-
-    def __len__(self) -> int:
-        return self._count
-
-    def append(self, sample: TelemetrySample) -> None:
-        """Append one sample."""
-        if self._count == len(self._buffer):
-            self._buffer = np.concatenate([self._buffer, np.empty_like(self._buffer)])
-        for name, column in self.COLUMNS.items():
-            self._buffer[self._count, column] = getattr(sample, name)
-        self._count += 1
-
-    def drop(self, count: int) -> None:
-        """Drop the oldest samples."""
-        kept = self._buffer[count : self._count].copy()
-        self._buffer, self._count = np.concatenate([kept, np.empty((256, 11))]), len(kept)
-
-    def copy(self) -> "_Rows":
-        """An independent copy."""
-        out = _Rows()
-        out._buffer, out._count = self._buffer.copy(), self._count
-        return out
-
-    def __getitem__(self, name: str) -> FloatArray:
-        """All values of a field; a view."""
-        return np.asarray(self._buffer[: self._count, self.COLUMNS[name]])
+def _row(sample: TelemetrySample) -> FloatArray:
+    row = np.empty(11)
+    for name, column in _COLUMNS.items():
+        row[column] = getattr(sample, name)
+    return row
 
 
 class TelemetryTrack:
@@ -148,7 +123,8 @@ class TelemetryTrack:
     def __init__(self, velocity_frame: str, max_gap_s: float, keep_s: float = 900.0) -> None:
         self._body = velocity_frame == "body"
         self._max_gap_s, self._keep_s = max_gap_s, keep_s
-        self._rows = _Rows()
+        self._table: FloatArray = np.empty((0, 11))
+        """Samples ``(N, 11)``; replaced, never changed, so that copies share it."""
         self._cached: Readings | None = None
         self._turn = Turn.AS_READ
         self.refused = 0
@@ -156,19 +132,20 @@ class TelemetryTrack:
 
     def add(self, samples: Sequence[TelemetrySample]) -> list[TelemetrySample]:
         """Append samples; returns those accepted, in the current velocity frame."""
-        used = []
+        used: list[TelemetrySample] = []
+        last_s = self.last_s
         for sample in samples:
             known = np.isfinite(sample.velocity_m_s).all() or np.isfinite(sample.rpy_rad).all()
-            if not (math.isfinite(sample.stamp_s) and sample.stamp_s > self.last_s and known):
-                self.refused += 1
-                continue
-            self._rows.append(sample)
-            used.append(self._turned(sample))
+            if math.isfinite(sample.stamp_s) and sample.stamp_s > last_s and known:
+                last_s = sample.stamp_s
+                used.append(sample)
+        self.refused += len(samples) - len(used)
         if used:
             self._cached = None
-            while self.last_s - self._rows["stamp_s"][0] > self._keep_s:
-                self._rows.drop(max(1, len(self) // 10))
-        return used
+            self._table = np.vstack([self._table, *map(_row, used)])
+            while self.last_s - self._table[0, 0] > self._keep_s:
+                self._table = self._table[max(1, len(self) // 10) :]
+        return [self._turned(sample) for sample in used]
 
     @property
     def turn(self) -> Turn:
@@ -198,17 +175,21 @@ class TelemetryTrack:
         return replace(sample, velocity_m_s=self._turn.rotation(sample.rpy_rad[None])[0] @ sample.velocity_m_s)
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self._table)
+
+    def _column(self, name: str) -> FloatArray:
+        """All values of a field."""
+        return self._table[:, _COLUMNS[name]]
 
     @property
     def last_s(self) -> float:
         """Stamp of the newest sample, minus infinity before the first."""
-        return float(self._rows["stamp_s"][-1]) if len(self) else -math.inf
+        return float(self._table[-1, 0]) if len(self) else -math.inf
 
     @property
     def battery(self) -> float:
         """Newest charge in [0, 1]; NaN if the last messages have none."""
-        lately = self._rows["battery"][-_RECENT:]
+        lately = self._column("battery")[-_RECENT:]
         finite = lately[np.isfinite(lately)]
         return float(finite[-1]) if len(finite) else math.nan
 
@@ -220,8 +201,7 @@ class TelemetryTrack:
         return self._cached
 
     def _build(self) -> Readings:
-        rows = self._rows.copy()
-        stamp, reported, raw_rpy = rows["stamp_s"], rows["velocity_m_s"], rows["rpy_rad"]
+        stamp, reported, raw_rpy = map(self._column, ("stamp_s", "velocity_m_s", "rpy_rad"))
         velocity, rpy = _filled(reported), np.unwrap(_filled(raw_rpy), axis=0)
         if self._turn is Turn.BACK:
             velocity = _applied(self._turn.rotation(rpy), velocity)
@@ -239,9 +219,9 @@ class TelemetryTrack:
             sign=sign,
             sign_path=_integral(stamp, sign),
             rpy=rpy,
-            tof=rows["tof_m"],
-            height=rows["height_m"],
-            baro=rows["baro_m"],
+            tof=self._column("tof_m"),
+            height=self._column("height_m"),
+            baro=self._column("baro_m"),
             has_velocity=_all(np.isfinite(reported)),
             has_attitude=_known_lately(stamp, _all(np.isfinite(raw_rpy)), self._max_gap_s),
             frozen=_frozen(stamp, reported, raw_rpy),
@@ -277,9 +257,7 @@ class TelemetryTrack:
 
     def copy(self) -> "TelemetryTrack":
         """A copy for another thread."""
-        out = TelemetryTrack("body" if self._body else "world", self._max_gap_s, self._keep_s)
-        out._rows, out._cached, out._turn, out.refused = self._rows.copy(), self._cached, self._turn, self.refused
-        return out
+        return copy(self)
 
     def attitude(self, stamps_s: FloatArray) -> FloatArray:
         """Body to power-on world ``(N, 3, 3)``."""
@@ -339,7 +317,7 @@ class TelemetryTrack:
             return 0.0
         stamp = self.readings.stamp_s
         log_odds = 0.0
-        for v in np.rint(np.nan_to_num(self._rows["velocity_m_s"]) / step_m_s).T:
+        for v in np.rint(np.nan_to_num(self._column("velocity_m_s")) / step_m_s).T:
             far = np.flatnonzero(np.abs(v) >= 3)
             for i, j in zip(far[:-1], far[1:], strict=True):
                 if v[i] * v[j] < 0 and j - i > 1 and stamp[j] - stamp[i] < 4.0:
@@ -350,7 +328,7 @@ class TelemetryTrack:
     @property
     def has_attitude(self) -> bool:
         """Whether any sample has roll, pitch and yaw."""
-        return bool(_all(np.isfinite(self._rows["rpy_rad"])).any())
+        return bool(_all(np.isfinite(self._column("rpy_rad"))).any())
 
     def warnings(self) -> list[str]:
         """Problems visible in the readings alone."""
