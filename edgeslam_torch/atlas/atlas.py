@@ -161,21 +161,18 @@ class Atlas:
     def _link(self, keyframe: Keyframe, other: Keyframe) -> Link | None:
         """A verified link that agrees with what is known of the relation of both ends.
 
-        The scale at both ends of a loop without parallax is equal within the drift. Unrelated submaps are linked by
-        images alone, and then need a scale from them.
+        The scale at both ends of a loop without parallax is equal within the drift; such a loop needs depths that are
+        not on one plane.
         """
-        mine, theirs = self.map.piece_of(keyframe.id), self.map.piece_of(other.id)
-        if mine == theirs:
+        loop = self.map.piece_of(keyframe.id) == self.map.piece_of(other.id)
+        if loop:
             found = link(self.tracker, keyframe, other, LOOP_SHARE, (1.0, PLACE_LOG))
-            if found is None or (not found.by_images and self._is_flat(found)):
-                return None
         else:
             found = link(self.tracker, keyframe, other)
-            if found is None:
-                return None
+        if found is None or (not found.by_images and self._is_flat(found)):
+            return None
         belief = self.graph.between(keyframe, other, found.depth)
-        agrees = found.by_images if belief is None else belief.allows(found.S, keyframe.T_c_w)
-        return found if agrees else None
+        return found if belief is None or belief.allows(found.S, keyframe.T_c_w) else None
 
     def _is_flat(self, one: Link) -> bool:
         """Whether the anchors of a link lie on one plane, such as a wall with repetitive wallpaper."""

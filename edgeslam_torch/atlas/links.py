@@ -2,8 +2,8 @@
 
 The keyframe is relocalised in the other submap like a lost frame (`tracking/relocaliser.py`). This gives its pose there
 from hundreds of keypoints, up to scale: keypoints with an anchor in both submaps have two independent depths, whose
-ratios must agree. A camera that rotates in place has no such pairs; sensors may give the scale then. Finally the other
-keyframe, relocalised in the first submap, must confirm the similarity.
+ratios must agree. A camera that rotates in place has no such pairs; within one submap the scale is equal then. Finally
+the other keyframe, relocalised in the first submap, must confirm the similarity.
 """
 
 from dataclasses import dataclass
@@ -34,9 +34,6 @@ MIN_AGREEING = 0.6
 """Share of those keypoints that must agree on the scale; of unrelated depths a quarter does."""
 MAX_SIGMA_LOG = 0.03
 """Standard deviation of the common log scale."""
-SENSOR_SCALE_SHARE = 0.2
-"""Share of the anchors in view that must be matched where images give no scale; repetitive wallpaper reaches 0.16 at a
-wrong place."""
 PLANE_PART, ON_PLANE = 0.9, 0.02
 """Share of the anchors, and their maximum distance from a plane relative to the depth, for a planar scene."""
 PLANE_FITS = 5
@@ -110,8 +107,6 @@ def link(
         return None
     ratio = log_ratios(tracker, keyframe, there.track)
     by_images = len(ratio) >= MIN_COMMON
-    if not by_images and there.share < SENSOR_SCALE_SHARE:
-        return None
     scale = agreed_scale(ratio) if by_images else otherwise
     if scale is None:
         return None
