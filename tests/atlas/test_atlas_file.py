@@ -223,7 +223,7 @@ def test_every_truncated_file_is_rejected(rng, tmp_path):
         refused(path)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_flipped_bytes_give_an_atlas_or_one_line(rng, tmp_path, seed):
     """Whatever is in the file: it is refused, or the map is consistent."""
     path, dice = tmp_path / "room.atlas", np.random.default_rng(seed)

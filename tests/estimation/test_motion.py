@@ -206,7 +206,7 @@ def test_while_flying_the_scale_is_the_present_one(fused, swinging, replay):
         shrunk[:, :3, 3] = shrunk[0, :3, 3] + np.cumsum(steps, axis=0)
         replay(fusion, motion, replace(gauge, T_m_c=shrunk), samples)
 
-    for seed in range(3):
+    for seed in range(2):
         fusion, gauge = fused(motion, feed=feed, seed=seed)
         off.append(math.log(fusion.scale().value / gauge.scale))
         z.append(z_of(fusion.scale(), gauge))
@@ -339,8 +339,8 @@ def test_prediction_bridges_lost_vision(fused, swinging, replay, gap_s):
 
         replay(fusion, motion, gauge, samples, tracked=seen, each=each)
 
-    fused(swinging(24.0), feed=feed)
-    assert len(errors) >= 8
+    fused(swinging(17.0), feed=feed)
+    assert len(errors) >= 4
     assert np.mean(errors) < (1.0 if gap_s < 0.1 else 0.4) * np.mean(still)
 
 
