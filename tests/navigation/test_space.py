@@ -150,22 +150,6 @@ def test_redundant_views_are_dropped():
     assert cell(layer, 0.75, 0.05) == (True, False) and cell(layer, 1.55, 0.05) == (True, False)
 
 
-def test_reset_wall_stays_unknown_until_observed_again():
-    """The space in front stays free, the wall is not freed."""
-    space, there = Space(), facing_a_wall(x=1.0).T_w_c
-    seen(space)
-    space.doubt_solids()
-    layer = space.layer(1.15, 0.15)
-    assert cell(layer, 1.55, 0.05) == (True, False) and not layer.solid.any() and not cell(layer, 2.05, 0.05)[0]
-    space.correct(moved(0, there))
-    layer = space.layer(1.15, 0.15)
-    assert cell(layer, 2.55, 0.05) == (True, False) and not layer.solid.any()
-    layer = seen(space, x=1.0, picture=1)
-    assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
-    space.correct(longer(1.0))
-    assert space.layer(1.15, 0.15).solid.any(), "what was seen again stays"
-
-
 def test_grid_follows_the_drone():
     space = Space()
     before = cell(seen(space), 1.55, 0.05)
