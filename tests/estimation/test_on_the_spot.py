@@ -11,7 +11,7 @@ from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.geometry.mount import camera_on_body
-from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
+from edgeslam_torch.synthetic.flights.telemetry import simulate
 
 T_B_C = camera_on_body()
 STAMPS_S = np.arange(0.0, 24.0, 0.1)
@@ -34,10 +34,6 @@ def mapped(rng, T_w_c, growth):
     T[1:, :3, 3] = T[0, :3, 3] + np.cumsum(steps, axis=0)
     T[:, :3, 3] += 0.003 * rng.standard_normal((len(T), 3))
     return T
-
-
-def truncated(sample):
-    return replace(sample, velocity_m_s=0.1 * np.trunc(10.0 * sample.velocity_m_s))
 
 
 def in_the_end(T_w_c, T_m_c, rng, change=lambda sample: sample, faults=None):
@@ -107,13 +103,3 @@ def test_velocities_in_another_unit_than_the_heights_are_not_explained_by_trunca
         half = in_the_end(T_w_c, T_m_c, rng, lambda s: replace(s, velocity_m_s=0.5 * s.velocity_m_s))
         assert half.metres.sensor_scale is None
         assert any("contradict each other" in said for said in half.warnings())
-
-
-def test_truncated_velocities_give_the_scale():
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        T_w_c = turning(rng, size_m=0.18)
-        T_m_c = mapped(rng, T_w_c, as_it_is(rng))
-        fusion = in_the_end(T_w_c, T_m_c, rng, truncated, TelemetryFaults(quantise=False))
-        assert "telemetry" in fusion.metres.sensor_scale.source
-        assert sigmas_off(fusion, T_m_c, T_w_c) < 2.0
