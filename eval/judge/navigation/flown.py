@@ -3,9 +3,6 @@
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-PERCEPTIONS = ("truth", "slam", "udp")
-"""Source of the planner's states: true pose and depth, or the SLAM; the SLAM over UDP in real time."""
-
 
 @dataclass(frozen=True, slots=True)
 class Case:
@@ -15,7 +12,7 @@ class Case:
     seed: int
     fault: str = "none"
     perception: str = "truth"
-    """One of `PERCEPTIONS`."""
+    """Source of the planner's states: ``truth``, ``slam``, or ``udp`` (the SLAM over UDP in real time)."""
     behaviour: str = "goto"
     """A name in `behaviours.BEHAVIOURS`."""
 

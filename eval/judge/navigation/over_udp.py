@@ -3,8 +3,6 @@
 import math
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +12,7 @@ from edgeslam_torch.drone.udp import open_udp
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.judge.navigation.behaviours import REACHED_M
-from edgeslam_torch.eval.judge.navigation.flight import check, contact_events
+from edgeslam_torch.eval.judge.navigation.flight import contact_events
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.eval.judge.navigation.perception import IMAGE_SIZE
 from edgeslam_torch.flying.navigator import Navigator
@@ -49,18 +47,12 @@ def emulate(world: str, seed: int, ports: tuple[int, int], pipe: Connection) -> 
         pipe.send((*away, contacts, nearest[0] - NavLimits().radius_m, down))
 
 
-def run_flight(case: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """What the process of a case does."""
-    return {"flown": fly_over_udp(Case(**case["flight"])).record()}
-
-
 def fly_over_udp(case: Case) -> Flown:
     """One flight to the site's goal; with the figures that the emulator provides.
 
     Raises:
         EvaluationError: If the case is another task than that, or has a fault.
     """
-    check(case)
     if (case.fault, case.behaviour) != ("none", "goto"):
         raise EvaluationError(f"{case.behaviour} with fault {case.fault}: over UDP only goto without a fault is flown")
     with open_udp(("127.0.0.1", 0), "free") as a, open_udp(("127.0.0.1", 0), "free") as b:
