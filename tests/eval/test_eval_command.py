@@ -69,18 +69,6 @@ def test_two_runs_are_compared(run_folder, tmp_path, capsys):
         run(compare_command, tmp_path / "a", tmp_path / "b")
 
 
-def test_peers_are_compared_on_common_frames_and_told_apart(run_folder, tmp_path, capsys):
-    truth = run_folder(tmp_path / "a")
-    (tmp_path / "peer").mkdir()
-    rows = (tmp_path / "a" / "trajectory.txt").read_text().splitlines(keepends=True)
-    (tmp_path / "peer" / "a").write_text("".join(rows[81:]))
-    assert run(eval_command, tmp_path / "a", tmp_path / "peer" / "a", "--groundtruth", truth, "--common-frames") == 0
-    text = capsys.readouterr().out
-    assert "On the 120 frames that all 2 have" in text
-    common = [line.split()[:2] for line in text.split("On the 120")[1].splitlines()]
-    assert [str(tmp_path / "peer" / "a"), "120"] in common and [str(tmp_path / "a"), "200"] in common
-
-
 def test_file_without_stamps_is_laid_on_the_images(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     dataset = tmp_path / "data"
@@ -106,20 +94,6 @@ def test_coverage_counts_frames_that_rest_on_their_own_image(run_folder, tmp_pat
     assert score.coverage == pytest.approx(197 / 200)  # three lost
     assert score.with_pose == 1.0
     assert score.map is None and "depth" in score.map_note
-
-
-@pytest.mark.parametrize("what", ["missing", "file", "no ground truth"])
-def test_wrong_folders_get_one_line(what, run_folder, tmp_path):
-    truth = run_folder(tmp_path / "a")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(EdgeSlamError) as caught:
-        if what == "missing":
-            run(eval_command, tmp_path / "none", "--groundtruth", truth)
-        elif what == "file":
-            run(report_command, truth)
-        else:
-            run(eval_command, tmp_path / "a", "--groundtruth", tmp_path / "empty")
-    assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
 
 
 def test_report_of_a_bare_run_is_a_page_too(run_folder, tmp_path):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from small_depth import METADATA, SmallDepth
+from small_depth import METADATA
 from small_depth import small_depth as network
 
 from edgeslam_torch.errors import ConfigError, SourceError, WeightsError
@@ -125,16 +125,6 @@ def test_interrupt_and_broken_hook_lose_no_step(whole, tmp_path, error):
     assert_same(whole, run(tmp_path / "stopped"))
 
 
-def test_interrupt_in_the_validation_is_validated_after_the_resume(whole, tmp_path):
-    def interrupted(_):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(network(), METADATA, [signal()], CONFIG, tmp_path / "stopped", interrupted)
-    assert saved_step(tmp_path / "stopped" / "last.pt") == 3
-    assert_same(whole, run(tmp_path / "stopped"))
-
-
 def test_interrupt_between_two_weights_of_a_step_saves_the_step_before(whole, tmp_path, monkeypatch):
     steps = []
     real = torch.optim.AdamW.step
@@ -185,12 +175,6 @@ def test_damaged_state_is_named(tmp_path, content):
     (tmp_path / "last.pt").write_bytes(content)
     with pytest.raises(WeightsError, match=r"last\.pt: damaged"):
         run(tmp_path)
-
-
-def test_state_of_another_network_is_named(tmp_path):
-    run(tmp_path)
-    with pytest.raises(WeightsError, match=r"last\.pt: .*another network"):
-        train(SmallDepth(width=16), METADATA, [signal()], CONFIG, tmp_path)
 
 
 class _PoisonedAt(Supervised):

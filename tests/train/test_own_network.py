@@ -59,6 +59,7 @@ def test_another_network_learns_from_labels_and_is_restored_from_the_best_file(t
     )
 
 
+@pytest.mark.slow
 def test_another_network_is_exported_and_flies(tmp_path):
     torch.manual_seed(0)
     network = Rows()

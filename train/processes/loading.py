@@ -39,25 +39,29 @@ def drawn(draw: Callable[[int], T], first: int, last: int, workers: int) -> Iter
     if workers == 0:
         yield map(draw, range(first, last))
         return
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # its threads do not survive a fork: a child that used them would deadlock
     try:
-        yield _unpacked(_started(_loader(draw, range(first, last), workers)))
+        batches = iter(
+            DataLoader(
+                _Steps(draw),
+                batch_size=None,
+                sampler=range(first, last),
+                num_workers=workers,
+                prefetch_factor=AHEAD,
+                worker_init_fn=_one_thread,
+                generator=torch.Generator(),  # without one, it draws from torch's, and changes what others draw
+            )
+        )
+    finally:
+        cv2.setNumThreads(threads)
+    try:
+        yield _unpacked(batches)
     except RuntimeError as error:
         if "DataLoader worker" not in str(error):
             raise
         why = " ".join(str(error).split())[:160]
         raise WorkerError(f"a process that draws batches ended ({why}); fewer --workers take less memory") from error
-
-
-def _loader(draw: Callable[[int], T], steps: range, workers: int) -> DataLoader[Any]:
-    return DataLoader(
-        _Steps(draw),
-        batch_size=None,
-        sampler=steps,
-        num_workers=workers,
-        prefetch_factor=AHEAD,
-        worker_init_fn=_one_thread,
-        generator=torch.Generator(),  # without one, the loader draws from torch's, and changes what others draw
-    )
 
 
 def _unpacked(batches: Iterator[Any]) -> Iterator[Any]:
@@ -75,16 +79,6 @@ def _unpacked(batches: Iterator[Any]) -> Iterator[Any]:
             if worker.sentinel in closed:
                 worker.join()
         raise RuntimeError(f"DataLoader worker is gone: {error}") from error
-
-
-def _started(loader: DataLoader[Any]) -> Iterator[Any]:
-    """The loader at work. OpenCV's threads do not survive a fork: a child that used them would deadlock."""
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        return iter(loader)
-    finally:
-        cv2.setNumThreads(threads)
 
 
 class _Steps(Dataset[Any]):

@@ -107,12 +107,6 @@ def test_by_the_true_pose_it_explores_finds_the_door_and_comes_home():
 
 
 @pytest.mark.slow
-def test_by_the_true_pose_it_follows_a_corridor_round_its_corner():
-    found = fly(Case("l_corridor", 1, behaviour="corridor"))
-    assert found.reached and found.contacts == 0
-
-
-@pytest.mark.slow
 def test_a_hung_planner_ends_on_the_floor_without_contact():
     found = fly(Case("blank_walls", 0, "hung"))
     assert not found.reached and found.landed and found.contacts == 0

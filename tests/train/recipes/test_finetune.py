@@ -22,7 +22,6 @@ from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import loop
 from edgeslam_torch.train.callbacks import ProgressBar
 from edgeslam_torch.train.state import saved_step
-from edgeslam_torch.writers.own_folder import FolderLock
 
 METADATA = Metadata(
     input_height=32, input_width=64, focal_px=60.0, data=("rooms",), licence="Apache-2.0", metrics={"abs_rel": 0.2}
@@ -188,13 +187,6 @@ def test_files_that_no_finetuning_wrote_are_left_alone(finetune, recordings, tmp
     refused(finetune(str(own), out=own), "is a training folder; give another --out")
     refused(finetune("kitchen", out=own), "holds rgb.txt")
     assert contents(own) == before
-
-
-def test_two_at_the_same_time_are_refused(finetune, tmp_path):
-    (tmp_path / "out").mkdir()
-    lock = FolderLock(tmp_path / "out")
-    refused(finetune("kitchen"), f"process {os.getpid()}")
-    lock.release()
 
 
 def test_out_that_cannot_be_written_is_one_line(finetune, tmp_path):
