@@ -82,7 +82,7 @@ def test_scale_and_vertical_with_honest_sigmas(kind: ImuModel) -> None:
 def test_sigma_of_a_short_flight_is_honest() -> None:
     model = mounted(ADIS16448, T_IMU_CAM)
     z = []
-    for seed in range(12):
+    for seed in range(16):
         alignment = fitted(flight("free", model, seed, seconds=4.5), model).alignment
         assert alignment is not None
         z.append((alignment.log_scale - math.log(SCALE)) / alignment.sigma_log_scale)
