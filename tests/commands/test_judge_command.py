@@ -8,10 +8,10 @@ from rendered import panels
 from edgeslam_torch import cli
 
 
-@pytest.fixture
-def data(tmp_path):
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
     """A folder with one recording of 30 images."""
-    return panels().first(30).write(tmp_path / "data" / "stairs").parent
+    return panels().first(30).write(tmp_path_factory.mktemp("data") / "stairs").parent
 
 
 @pytest.mark.slow
