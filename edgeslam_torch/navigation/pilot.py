@@ -8,19 +8,19 @@ import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.arcs import Arcs, candidates
-from edgeslam_torch.navigation.contact.losses import Losses
+from edgeslam_torch.navigation.contact import Losses
 from edgeslam_torch.navigation.drone_state import HOVER, Contact, DroneState, VelocityCommand, View
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.map_views import MapViews, Places
-from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
+from edgeslam_torch.navigation.openings.exit_tracker import PLACES_M, ExitTracker
 from edgeslam_torch.navigation.openings.wall_frame import Walls
 from edgeslam_torch.navigation.route import TIGHT_M, CostToGo, cost_to_go
-from edgeslam_torch.navigation.skills.skill import NO_WAY, Result, Skill
+from edgeslam_torch.navigation.skills.skill import NO_WAY, ROUND_S, Result, Skill
 from edgeslam_torch.navigation.space import CELL_M, Space
 from edgeslam_torch.navigation.speed_dither import dithered
 from edgeslam_torch.navigation.supervisor import DEAD_RECKONING_SIGMA_M
-from edgeslam_torch.navigation.views import SAME_PLACE_M, ViewPlanner
+from edgeslam_torch.navigation.views import ViewPlanner
 from edgeslam_torch.types import FloatArray
 
 BAND_M = 0.05
@@ -32,18 +32,15 @@ _AHEAD_M = 0.8
 """Look-ahead distance along the path."""
 _FACING_RAD = math.radians(30.0)
 """Heading error beyond which the drone turns first: it flies only where the camera looks."""
-_SLOW = 0.6
-"""Share of the speed outside the field of view, beside unknown cells at hull distance, and back along the path."""
+_SIDEWAYS, _SLOW = 0.3, 0.6
+"""Shares of the speed: outside the field of view, through space observed before; and beside unknown cells at hull
+distance, or back along the path."""
 _STANDS_M_S = 0.1
 """Speed below which unknown cells of the next metre are viewed first: from closer they are out of the picture."""
 _GAIN_M = 0.04
 """Minimum reduction of the cost to go by a movement [m]."""
 _MOVES_S = 1.0
 """Maximum wait for a view after a scale revision; views come at 5 Hz."""
-_LOST_S = 15.0
-"""Time without progress, a full look around, after which only its views count; the next time a skill has no way."""
-_LOST_M = 1.5
-"""Distance within which tracking losses belong to one place."""
 _UPRIGHT_M, _UPRIGHT_SHARE = (0.7, 1.5), 0.7
 """Heights visible on a wall two metres away, and the occupied share that makes a column a wall."""
 
@@ -86,7 +83,7 @@ class Pilot:
     _view: View | None = None
     """The last view, for the camera's field of view."""
     _views: ViewPlanner = field(init=False)
-    _losses: Losses = field(default_factory=lambda: Losses(_LOST_M))
+    _losses: Losses = field(default_factory=Losses)
     """Tracking losses since the skill began."""
     _submap: int = 0
     """Current submap."""
@@ -100,7 +97,7 @@ class Pilot:
         """Switch to another skill."""
         self.skill, self.result = skill, None
         self._plan, self._progress, self._views.look = None, Places(), None
-        self._losses = Losses(_LOST_M)
+        self._losses = Losses()
 
     @property
     def phase(self) -> Phase:
@@ -202,7 +199,7 @@ class Pilot:
         here, stands = state.p_w[:2], float(np.linalg.norm(state.velocity_w[:2])) < _STANDS_M_S
         looks = self._views.taking(state) is not None or self.skill.looks(state, self._views)
         looks = looks or (stands and state.tracked and self._views.look_first(state))
-        if not self._progress.is_near(here, SAME_PLACE_M):
+        if not self._progress.is_near(here, PLACES_M):
             self._progress, self._progress_s, self._started_over = Places(state.views, here), state.stamp_s, False
         if looks or state.overridden:
             self._progress_s = state.stamp_s
@@ -210,7 +207,7 @@ class Pilot:
             look = self._views.look
             turn = 0.0 if look is None else self._turn(state.turn_to_rad(look.heading_rad))
             return VelocityCommand(turn_left_rad_s=turn, why="look")
-        if state.stamp_s - self._progress_s > _LOST_S:
+        if state.stamp_s - self._progress_s > ROUND_S:
             self._start_over(state)
             return HOVER
         plan = self._planned(state)
@@ -295,7 +292,7 @@ class Pilot:
         slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SLOW * self.limits.speed_m_s + 1e-6
         hull_m = self._hull_m(state)
         beside = arcs.from_solid_m >= self.limits.clearance_m(state.position_sigma_m)
-        beside &= self._views.exhausted.is_near(state.p_w[:2], SAME_PLACE_M)
+        beside &= self._views.exhausted.is_near(state.p_w[:2], PLACES_M)
         back = (arcs.from_solid_m >= hull_m + 0.5 * CELL_M) & self.space.was_at(arcs.p_w).all(axis=1)
         return np.asarray(slow & (arcs.clearance_m >= hull_m) & (beside | back))
 
@@ -305,9 +302,9 @@ class Pilot:
 
     def _score(self, arcs: Arcs, plan: CostToGo, state: DroneState, error: float) -> FloatArray:
         """Cost to go after each candidate plus a penalty for low clearance; infinite for fast ones outside the view."""
-        away = arcs.from_solid_m if self._views.exhausted.is_near(state.p_w[:2], SAME_PLACE_M) else arcs.clearance_m
+        away = arcs.from_solid_m if self._views.exhausted.is_near(state.p_w[:2], PLACES_M) else arcs.clearance_m
         score = np.asarray(plan.at(arcs.end_w)) + 0.5 * np.clip(TIGHT_M - away, 0.0, None)
-        fast = np.linalg.norm(arcs.velocity_w, axis=1) > _SLOW * self.limits.speed_m_s + 1e-6
+        fast = np.linalg.norm(arcs.velocity_w, axis=1) > _SIDEWAYS * self.limits.speed_m_s + 1e-6
         off = np.abs(wrapped(np.arctan2(arcs.velocity_w[:, 1], arcs.velocity_w[:, 0]) - state.yaw_rad))
         score[fast & ((off > _FACING_RAD) | (abs(error) > _FACING_RAD))] = np.inf
         return score

@@ -21,8 +21,6 @@ from edgeslam_torch.navigation.openings.exit_tracker import FARTHEST_M, FIELD_RA
 from edgeslam_torch.navigation.openings.exits import NARROWEST_M
 from edgeslam_torch.types import FloatArray
 
-SAME_PLACE_M = 0.5
-"""Distance within which views are from one place."""
 EVERY_M = 1.2
 """Distance between places of looking around: a door of 0.85 m is seen from two. What stays unknown from within it lies
 outside the vertical field of view."""
@@ -34,12 +32,9 @@ _STANDS_S = 0.6
 """Duration of a view: three depth maps at 5 Hz, of which two free a cell."""
 _OPENING_S = 1.2
 """The same of an opening: two updates of its odds, as much as one viewpoint may add."""
-_TIMEOUT_S = 6.0
-"""Half a turn and a rise, and half as much again."""
-_PASSED_M = 0.25
-"""Distance from obstacles at which the drone passes; what is closer to one is unreachable."""
-_ARRIVED_M = 0.25
-"""Distance that counts as arrived at a viewpoint."""
+_PASSED_M = NavLimits().clearance_m(0.0)
+"""Distance from obstacles at which the drone passes: what is closer to one is unreachable. Distance that counts as
+arrived at a viewpoint."""
 _SQUARELY_COS = math.cos(math.radians(40.0))
 """Maximum angle to a border's normal for a frontal view: half a metre is visible through a door in a 10 cm wall."""
 _BEFORE_M, _BEFORE_COS = (0.8, 2.0), math.cos(math.radians(17.0))
@@ -184,7 +179,8 @@ class ViewPlanner:
             self._stands_s = math.nan
         elif math.isnan(self._stands_s):
             self._stands_s = state.stamp_s
-        late = state.stamp_s - self._since_s > _TIMEOUT_S + self.look.stands_s
+        turn_s = 2.0 * math.pi / self.limits.turn_rad_s  # half a turn takes half of it
+        late = state.stamp_s - self._since_s > turn_s + self.look.stands_s
         if late or state.stamp_s - self._stands_s > self.look.stands_s or not state.tracked:
             self._taken.append(self.look)
             self.look, self._goes_on = None, self._goes_on and state.tracked
@@ -230,7 +226,7 @@ class ViewPlanner:
         if self._goes_on:
             self._around.keep(slice(-1))
         targets = targets[self._shown_anew(here[None], 0.8)[0]]
-        worth = targets.width_m.sum() >= NARROWEST_M or self._goals.is_near(here, _ARRIVED_M)
+        worth = targets.width_m.sum() >= NARROWEST_M or self._goals.is_near(here, _PASSED_M)
         if not self._goes_on and not worth:
             return False
         self._around.add(state.views, here)
@@ -308,7 +304,7 @@ class ViewPlanner:
             least: Minimum of what it must show together.
             state: The drone's state.
         """
-        if not self._place.is_near(state.p_w[:2], SAME_PLACE_M):
+        if not self._place.is_near(state.p_w[:2], PLACES_M):
             self._place, self._taken = Places(state.views, state.p_w[:2]), []
         width = width * ~np.any([shows(look) for look in self._taken], axis=0) if self._taken else width
         best, most = None, 0.0

@@ -21,10 +21,6 @@ def cell(layer, x, y):
     return bool(layer.free[i, j]), bool(layer.solid[i, j])
 
 
-def test_unknown_space_is_not_free():
-    assert not Space().layer(1.15, 0.15).free.any()
-
-
 def test_wall_is_occupied_front_free_back_unknown():
     layer = seen(Space())
     assert cell(layer, 1.55, 0.05) == (True, False)
@@ -128,19 +124,6 @@ def test_grid_follows_map_corrections():
     assert not cell(layer, 0.55, 0.05)[0]
 
 
-def test_grid_follows_scale_changes():
-    """Metres of 2 m become 1.5 times as long: the wall is 3 m away, and a place flown through 1 m to the side 1.5 m."""
-    space = Space()
-    seen(space)
-    space.flown(np.array([0.0, 1.0, 1.15]), 0.2)
-    space.correct(moved(0, facing_a_wall().T_w_c, 1.5))
-    layer = space.layer(1.15, 0.15)
-    assert cell(layer, 2.55, 0.05) == (True, False)
-    assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
-    layer = space.layer(1.15, 0.05)
-    assert cell(layer, 0.05, 1.55)[0] and not cell(layer, 0.05, 1.05)[0]
-
-
 def test_redundant_views_are_dropped():
     space = Space()
     for k in range(300):
@@ -157,14 +140,6 @@ def test_grid_follows_the_drone():
     layer = space.layer(1.15, 0.15)
     assert layer.corner_w[0] == pytest.approx(-8.0 + 4.0)
     assert cell(layer, 1.55, 0.05) == before
-
-
-def test_points_of_the_map_are_solid():
-    space = Space()
-    seen(space)
-    space.mark(np.array([[1.05, 0.05, 1.15]]))
-    layer = space.layer(1.15, 0.15)
-    assert cell(layer, 1.05, 0.05) == (False, True)
 
 
 def test_unknown_depth_changes_nothing():
@@ -198,22 +173,6 @@ def test_contact_stays_occupied():
     assert cell(layer, 1.22, 0.05) == (False, True), "ahead of the drone"
     assert cell(layer, 0.88, 0.05) == (True, False), "not behind it"
     assert cell(layer, 1.05, 0.25) == (True, False), "not beside it"
-
-
-def test_contacts_follow_map_corrections():
-    space, shifted = Space(), np.eye(4)
-    space.map_views.add(0, np.eye(4))
-    space.add_contact(Contact(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
-    shifted[:3, 3] = [1.0, 2.0, 0.0]
-    space.correct(moved(0, shifted))
-    layer = space.layer(1.15, 0.15)
-    assert cell(layer, 2.22, 2.05)[1] and not cell(layer, 1.22, 0.05)[1]
-
-
-def test_contact_outside_the_grid_is_ignored():
-    space = Space()
-    space.add_contact(Contact(np.array([100.0, 0.0, 1.15]), np.array([1.0, 0.0])), 0.17)
-    assert not space.layer(1.15, 0.15).solid.any()
 
 
 def test_path_flown_follows_grid_and_map():

@@ -89,15 +89,6 @@ def test_other_views_cover_nothing(state):
     assert len(coverage.unlooked(WALL).p_w) == len(WALL.p_w)
 
 
-def test_coverage_follows_map_corrections():
-    """Metres become half as long: what was seen 2 m away is 1 m away."""
-    coverage, views = Coverage(), MapViews()
-    coverage.note(at(2.0, 0.0, 90.0, views=views))
-    views.correct(longer(0.5))
-    left = coverage.unlooked(WALL).p_w[:, 0]
-    assert not ((left > 0.7) & (left < 1.3)).any()
-
-
 def test_borders_face_the_free_space():
     found = borders(CORRIDOR, np.zeros(2))
     long = (found.p_w[:, 0] > 0.0) & (found.p_w[:, 0] < 4.0)

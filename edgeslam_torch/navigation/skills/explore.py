@@ -9,11 +9,8 @@ import numpy as np
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
-from edgeslam_torch.navigation.skills.skill import Result, Skill
+from edgeslam_torch.navigation.skills.skill import ROUND_S, Result, Skill
 from edgeslam_torch.navigation.views import ViewPlanner
-
-_ROUND_S = 13.0
-"""A full turn and a second: without a viewpoint for so long, nothing is left to explore."""
 
 
 @dataclass(slots=True)
@@ -34,7 +31,7 @@ class Explore(Skill):
 
     def result(self, state: DroneState, losses: int = 0) -> Result | None:
         """Reached when nothing is left to explore; tracking losses do not end it, since other places remain."""
-        if state.stamp_s - self._nothing_s > _ROUND_S:
+        if state.stamp_s - self._nothing_s > ROUND_S:
             return Result(True, "nothing is left to explore")
         return super(Explore, self).result(state)
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from edgeslam_torch.navigation.contact import LOST_M
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
@@ -12,9 +13,9 @@ from edgeslam_torch.navigation.skills.skill import Result, Skill
 from edgeslam_torch.navigation.views import Look, ViewPlanner
 from edgeslam_torch.types import FloatArray
 
-_LOOK_M, _LOST_M = 0.6, 1.5
-"""Distance from the take-off at which the drone takes its initial heading; the second one after a tracking loss this
-close, as by a bare wall behind the take-off."""
+_LOOK_M = 0.6
+"""Distance from the take-off at which the drone takes its initial heading; `LOST_M` after a tracking loss this close,
+as by a bare wall behind the take-off."""
 _LOOK_S = 3.0
 """Duration of the look: two keyframes, a loop closure and a view at the new scale."""
 
@@ -55,8 +56,8 @@ class ReturnHome(Skill):
     def looks(self, state: DroneState, views: ViewPlanner) -> bool:
         """Once near the take-off, with its heading."""
         away = float(np.linalg.norm(state.p_w[:2]))
-        if not state.tracked and away < _LOST_M:
-            self._look_m = _LOST_M
+        if not state.tracked and away < LOST_M:
+            self._look_m = LOST_M
         if self._looked or away > self._look_m or not state.tracked:
             return False
         self._looked = True

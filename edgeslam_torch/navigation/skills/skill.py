@@ -14,8 +14,11 @@ from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.navigation.views import ViewPlanner
 
-MOST_LOSSES = 5
-"""Tracking losses at one place that end a skill: a view of a textureless surface fails repeatedly."""
+MOST_LOSSES, FEW_LOSSES = 5, 3
+"""Tracking losses at one place that end a skill: a view of a textureless surface fails repeatedly; and that end it at
+its goal."""
+ROUND_S = 15.0
+"""Time without progress after which obstacles are observed anew, and then a skill ends: a full look around."""
 
 
 @dataclass(frozen=True, slots=True)
