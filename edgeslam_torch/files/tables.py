@@ -20,6 +20,8 @@ from edgeslam_torch.types import FloatArray
 
 MAX_BYTES = 256 << 20
 """Default limit; a million poses take 100 MB."""
+MAX_LINES = 2_000_000
+"""Maximum number of lines, each of which takes half a kilobyte of memory; an IMU writes so many in three hours."""
 _COMMENTS = ("#", "%")
 """First characters of comment lines; ``%`` is that of MATLAB and of ``rostopic echo -p``."""
 _LOOKED_AT = 200
@@ -145,6 +147,8 @@ def read_table(path: Path, error: type[EdgeSlamError], columns: int | None = Non
         EdgeSlamError: As `read_text`.
     """
     text = read_text(path, error, max_bytes)
+    if max(text.count("\n"), text.count("\r")) > MAX_LINES:
+        raise error(f"{path}: more than {MAX_LINES} lines of a text table are not read")
     lines = [(i, line.strip("\r\v\f ")) for i, line in enumerate(text.split("\n"), start=1)]
     if "\r" in text and "\r\n" not in text and "\n" not in text:  # line ends of old Macs
         lines = [(i, line.strip()) for i, line in enumerate(text.split("\r"), start=1)]

@@ -88,7 +88,8 @@ class Recording(Steps):
     camera: Camera
     decode: Callable[[list[Problem]], Iterator[Frame]]
     """Frames, decoded on demand; appends skipped ones to ``problems``."""
-    length: int | None
+    count: int | None
+    """Frames that `decode` gives at most; None if unknown."""
     telemetry: list[TelemetrySample] = field(default_factory=list)
     groundtruth: Path | None = None
     problems: list[Problem] = field(default_factory=list)
@@ -101,9 +102,12 @@ class Recording(Steps):
     """Interval of used frames among the others."""
     imu: ImuModel | None = None
     imu_readings: ImuReadings | None = None
+    length: int | None = field(init=False)
 
     def __post_init__(self) -> None:
         self._listed = tuple(self.problems)
+        chosen = None if self.count is None else len(range(self.start, self.count, self.stride))
+        self.length = min((number for number in (chosen, self.max_frames) if number is not None), default=None)
 
     def frames(self) -> Iterator[Frame]:
         """Frames in time order; the next one is decoded while the caller works on this one."""
@@ -122,7 +126,7 @@ class Recording(Steps):
             raise SourceError(f"{self.location}: no frame from number {start} on")
         telemetry = [sample for sample in self.telemetry if sample.stamp_s >= first.stamp_s - 1.0]
         readings = None if self.imu_readings is None else self.imu_readings.between(first.stamp_s - 1.0, math.inf)
-        return replace(self, start=start, stride=stride, length=None, telemetry=telemetry, imu_readings=readings)
+        return replace(self, start=start, stride=stride, telemetry=telemetry, imu_readings=readings)
 
     def close(self) -> None:
         """Nothing to release."""
@@ -205,16 +209,13 @@ def open_source(
     model, readings, imu_warnings = _imu_of(content, folders, imu, imu_model, camera)
     default = content.default_camera
     chosen, warnings = choose_camera(content.size, camera, folders, default, bool(samples), content.own_camera)
-    length = content.length
-    if max_frames is not None:
-        length = max_frames if length is None else min(length, max_frames)
     return Recording(
         name=path.resolve().name,
         kind="flight" if samples and content.kind in ("tum", "video") else content.kind,
         location=str(path.resolve()),
         camera=chosen,
         decode=lambda problems: content.decode(content.size, problems),
-        length=length,
+        count=content.length,
         telemetry=samples,
         groundtruth=content.groundtruth,
         problems=content.problems,

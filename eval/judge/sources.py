@@ -84,7 +84,7 @@ def reordered(recording: Recording, images: Sequence[ImageEntry], order: IntArra
         return frames_of(played, size, problems)
 
     return replace(
-        recording, decode=decode, length=len(played), telemetry=[], imu=None, imu_readings=None, groundtruth=None
+        recording, decode=decode, count=len(played), telemetry=[], imu=None, imu_readings=None, groundtruth=None
     )
 
 
@@ -106,7 +106,7 @@ def followed_by(first: Recording, second: Recording, count: int, rate_hz: float)
         both = chain.from_iterable(islice(one.decode(problems), count) for one in (first, second))
         return (ChangedFrame(frame, i, i / rate_hz) for i, frame in enumerate(both))
 
-    return replace(first, decode=decode, length=2 * count, telemetry=[], imu=None, imu_readings=None, groundtruth=None)
+    return replace(first, decode=decode, count=2 * count, telemetry=[], imu=None, imu_readings=None, groundtruth=None)
 
 
 def made_of(images: Callable[[int], NDArray[np.uint8]], count: int, camera: Camera, rate_hz: float) -> Recording:

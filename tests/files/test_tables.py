@@ -4,6 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.files import tables
 from edgeslam_torch.files.tables import read_table
 from edgeslam_torch.files.time_units import UNKNOWN, seconds_of
 
@@ -28,6 +29,14 @@ def test_numbers_are_read_whatever_the_separator_header_and_encoding(tmp_path, s
     table = read_table(written(tmp_path, text, encoding), SourceError)
     assert table.numbers().tolist() == ROWS
     assert table.header == (("t", "x", "y") if header else ())
+
+
+@pytest.mark.parametrize("end", ["\n", "\r", "\r\n"])
+def test_a_small_file_of_very_many_lines_is_refused(tmp_path, end, monkeypatch):
+    monkeypatch.setattr(tables, "MAX_LINES", 1000)
+    with pytest.raises(SourceError, match="lines"):
+        read_table(written(tmp_path, f"1{end}" * 1001), SourceError)
+    assert len(read_table(written(tmp_path, f"1{end}" * 1000), SourceError).rows) == 1000
 
 
 @pytest.mark.parametrize("separator", [" ", "\t", ";", "; "])

@@ -186,3 +186,11 @@ def test_an_imu_beside_the_images_is_used_unless_the_user_says_otherwise(tmp_pat
     assert own.part(3, 1).imu_readings.stamps_s[0] >= 99.3
     with pytest.raises(SourceError, match="gone"):
         open_source(folder, imu=tmp_path / "gone.csv")
+
+
+@pytest.mark.parametrize("start", [0, 3])
+@pytest.mark.parametrize("stride", [1, 4])
+@pytest.mark.parametrize("most", [None, 2, 99])
+def test_the_length_of_a_part_is_the_number_of_its_frames(tmp_path, write_tum, start, stride, most):
+    part = open_source(write_tum(tmp_path / "seq", 12), max_frames=most).part(start, stride)
+    assert part.length == len(list(part.frames()))
