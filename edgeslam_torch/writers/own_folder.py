@@ -34,10 +34,10 @@ _HOLDER = "process "
 """Beginning of its text."""
 
 
-def check_free(folder: Path, outputs: Collection[str]) -> None:
+def check_free(folder: Path, outputs: Collection[str], remedy: str = "give another folder to --out") -> None:
     """Check that results named ``outputs`` may be written to the existing ``folder``.
 
-    Files of other names are ignored: a log, notes, a flight in a subfolder.
+    Files of other names are ignored: a log, notes, a flight in a subfolder. ``remedy`` is for the message.
 
     Raises:
         OutputError: If a result would replace a file that no run wrote, or would lie among the files of a recording.
@@ -46,7 +46,7 @@ def check_free(folder: Path, outputs: Collection[str]) -> None:
     if part is None and not _is_run(folder):
         part = _foreign(folder, outputs)
     if part is not None:
-        raise OutputError(f"{folder}: holds {part}, which no run wrote; give another folder to --out")
+        raise OutputError(f"{folder}: holds {part}, which no run wrote; {remedy}")
 
 
 def _foreign(folder: Path, outputs: Collection[str]) -> str | None:

@@ -65,7 +65,7 @@ def write_report(
     if run.path.is_file():
         raise EvaluationError(f"{run.path}: a report needs a run's folder, this is a single file")
     if out is None:
-        check_free(run.path, ())
+        check_free(run.path, (), "give the folder of a run")
     out = Path(out) if out is not None else run.path / "report.html"
     score, truth = judge_run(run, groundtruth, judge_map)
     write_text(out, render(run, score, truth))
