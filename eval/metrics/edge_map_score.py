@@ -144,7 +144,7 @@ def build_surface(dataset: EvalDataset) -> SurfaceTruth:
 
 
 def search_tree(p: FloatArray) -> "cKDTree":
-    """For the nearest of points ``(N, 3)``; built at once and unbalanced, as it is asked only once."""
+    """For the nearest of points ``(N, 3)``; unbalanced, as building it costs more than the dozen times it is asked."""
     from scipy.spatial import cKDTree  # 0.7 s to import, which a run without depth maps does not need
 
     return cKDTree(p, balanced_tree=False, compact_nodes=False)
