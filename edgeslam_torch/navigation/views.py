@@ -148,6 +148,8 @@ class ViewPlanner:
     """The view that is being taken."""
     exhausted: Places = field(default_factory=Places)
     """The last place from which no view shows more of the path."""
+    _has_looked: bool = False
+    """Whether the first view of the flight was begun; it may have come before the scale, and counts for no place."""
     _place: Places = field(default_factory=Places)
     _taken: list[Look] = field(default_factory=list)
     """Views taken there."""
@@ -189,9 +191,9 @@ class ViewPlanner:
     def look_first(self, state: DroneState) -> bool:
         """Begin the first view of a flight, ahead and from above: after take-off the space just ahead is below the
         picture. False after it."""
-        if len(self._place):
+        if self._has_looked:
             return False
-        self._place = Places(state.views, state.p_w[:2])
+        self._has_looked = True
         self.take(Look(state.yaw_rad, _RISE_M), state)
         return True
 

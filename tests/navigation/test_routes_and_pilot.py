@@ -12,7 +12,6 @@ from edgeslam_torch.navigation.arcs import candidates, flown
 from edgeslam_torch.navigation.drone_state import DroneState, VelocityCommand
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.pilot import Phase, Pilot
 from edgeslam_torch.navigation.route import cost_to_go
 from edgeslam_torch.navigation.skills.explore import Explore
@@ -198,7 +197,7 @@ def before_a_free_way():
     pilot = Pilot(GoTo(np.array([6.0, 0.0, 1.15])))
     for x in np.arange(-1.0, 7.0, 0.2):
         pilot.space.flown(np.array([x, 0.0, 1.15]), 0.8)
-    pilot._views._place = Places(pilot.views, [0.0, 0.0])
+    pilot._views._has_looked = True
     return pilot
 
 
@@ -252,6 +251,17 @@ def test_views_of_the_path_are_taken_ahead_and_from_above():
             looks.append(look)
     assert len(pilot._views.exhausted) and any(look.rise_m > 0.0 for look in looks)
     assert all(abs(look.heading_rad) < math.radians(100.0) for look in looks), "towards the path"
+
+
+def test_what_the_first_view_of_a_flight_may_have_missed_is_viewed_again():
+    """It is taken before the scale is known, so it shows nothing of the strip."""
+    planner, state = before_a_strip()._views, at(0.3, 0.05)
+    assert planner.look_first(state) and not planner.look_first(state)
+    first = planner.look
+    planner.taking(replace(state, stamp_s=20.0))
+    above = state.p_w[:2] + np.array([[0.8, 0.0], [0.9, 0.0]])
+    assert planner.look is None and planner.look_along(above, 0.0, facing_a_wall(), replace(state, stamp_s=20.0))
+    assert planner.look.rise_m == first.rise_m
 
 
 def test_after_a_failed_look_unknown_space_is_passed_slowly():
