@@ -292,7 +292,8 @@ class Pilot:
         slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SLOW * self.limits.speed_m_s + 1e-6
         hull_m = self._hull_m(state)
         beside = arcs.from_solid_m >= self.limits.clearance_m(state.position_sigma_m)
-        beside &= self._views.exhausted.is_near(state.p_w[:2], PLACES_M)
+        # After a start over, unknown cells may be obstacles that were dropped.
+        beside &= self._views.exhausted.is_near(state.p_w[:2], PLACES_M) and not self._started_over
         back = (arcs.from_solid_m >= hull_m + 0.5 * CELL_M) & self.space.was_at(arcs.p_w).all(axis=1)
         return np.asarray(slow & (arcs.clearance_m >= hull_m) & (beside | back))
 

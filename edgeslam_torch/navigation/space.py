@@ -139,11 +139,10 @@ class Space:
         self._build()
 
     def forget_before(self, seen_s: float) -> None:
-        """Drop everything but the views since a time."""
+        """Drop everything but the views since a time, and contacts: no view shows what was felt."""
         kept = [view for view in self._views if view.stamp_s >= seen_s]
         self._views = deque(kept, maxlen=MAX_VIEWS)
         self._flown, self._flown_m = Places(size=3), []
-        self._contacts = Places(size=3)
         self._build()
 
     def _build(self) -> None:
