@@ -20,8 +20,8 @@ from edgeslam_torch.types import FloatArray
 
 MAX_BYTES = 256 << 20
 """Default limit; a million poses take 100 MB."""
-MAX_LINES = 2_000_000
-"""Maximum number of lines, each of which takes half a kilobyte of memory; an IMU writes so many in three hours."""
+MAX_LINES, MAX_CELLS = 2_000_000, 30_000_000
+"""Maximum numbers; a line takes half a kilobyte of memory, a cell 60 bytes. An IMU writes so many in three hours."""
 _COMMENTS = ("#", "%")
 """First characters of comment lines; ``%`` is that of MATLAB and of ``rostopic echo -p``."""
 _LOOKED_AT = 200
@@ -147,8 +147,7 @@ def read_table(path: Path, error: type[EdgeSlamError], columns: int | None = Non
         EdgeSlamError: As `read_text`.
     """
     text = read_text(path, error, max_bytes)
-    if max(text.count("\n"), text.count("\r")) > MAX_LINES:
-        raise error(f"{path}: more than {MAX_LINES} lines of a text table are not read")
+    _check_counts(text, path, error)
     lines = [(i, line.strip("\r\v\f ")) for i, line in enumerate(text.split("\n"), start=1)]
     if "\r" in text and "\r\n" not in text and "\n" not in text:  # line ends of old Macs
         lines = [(i, line.strip()) for i, line in enumerate(text.split("\r"), start=1)]
@@ -169,6 +168,13 @@ def read_table(path: Path, error: type[EdgeSlamError], columns: int | None = Non
     _drop_empty_end(rows, len(header))
     comments = tuple(line.lstrip("#% ") for _, line in lines if line.startswith(_COMMENTS))
     return Table(path, header, tuple(rows), comments, error, bool(text) and not text.endswith(("\n", "\r")))
+
+
+def _check_counts(text: str, path: Path, error: type[EdgeSlamError]) -> None:
+    if max(text.count("\n"), text.count("\r")) > MAX_LINES:
+        raise error(f"{path}: more than {MAX_LINES} lines of a text table are not read")
+    if sum(text.count(separator) for separator in _SEPARATORS) > MAX_CELLS:
+        raise error(f"{path}: more than {MAX_CELLS} cells of a text table are not read")
 
 
 def _encoding(data: bytes) -> str:

@@ -1,5 +1,6 @@
 """Point clouds as binary PLY: ``x y z red green blue sigma observations``."""
 
+import re
 from pathlib import Path
 from typing import BinaryIO
 
@@ -123,7 +124,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, int, np.dtype]:
             return kind, count, np.dtype(fields)
         if words[:1] == ["format"] and len(words) > 1:
             kind = words[1]
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
+        elif words[:1] == ["element"] and len(words) == 3 and re.fullmatch("[0-9]{1,18}", words[2]):
             if not element and words[1] != "vertex":
                 raise SourceError(f"{path}: its first element is {words[1]!r}, points (vertex) must come first")
             element = words[1]

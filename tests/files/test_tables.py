@@ -31,12 +31,12 @@ def test_numbers_are_read_whatever_the_separator_header_and_encoding(tmp_path, s
     assert table.header == (("t", "x", "y") if header else ())
 
 
-@pytest.mark.parametrize("end", ["\n", "\r", "\r\n"])
-def test_a_small_file_of_very_many_lines_is_refused(tmp_path, end, monkeypatch):
-    monkeypatch.setattr(tables, "MAX_LINES", 1000)
-    with pytest.raises(SourceError, match="lines"):
+@pytest.mark.parametrize(("end", "limit"), [("\n", "LINES"), ("\r", "LINES"), ("\r\n", "LINES"), (" ", "CELLS")])
+def test_a_small_file_of_very_many_lines_or_cells_is_refused(tmp_path, end, limit, monkeypatch):
+    monkeypatch.setattr(tables, f"MAX_{limit}", 1000)
+    with pytest.raises(SourceError, match=limit.lower()):
         read_table(written(tmp_path, f"1{end}" * 1001), SourceError)
-    assert len(read_table(written(tmp_path, f"1{end}" * 1000), SourceError).rows) == 1000
+    assert read_table(written(tmp_path, f"1{end}" * 1000), SourceError).numbers().size == 1000
 
 
 @pytest.mark.parametrize("separator", [" ", "\t", ";", "; "])

@@ -44,6 +44,7 @@ def test_ascii_file_of_another_program(tmp_path):
         lambda b: b.replace(b"property float x", b"property blob x"),
         lambda b: b.replace(b"property float x", b"property float y"),
         lambda b: b.replace(b"property float x", b"property float q"),
+        lambda b: b.replace(b"vertex ", b"vertex " + b"9" * 5000),
     ],
 )
 def test_damaged_file_is_refused_by_name(tmp_path, cloud, damage):
