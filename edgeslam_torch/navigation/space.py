@@ -70,6 +70,8 @@ class Space:
     _corner: np.ndarray = field(init=False)
     """``(2,)`` int, world cell at the grid's corner."""
     _views: deque[View] = field(init=False)
+    _doubted: int = field(init=False)
+    """Number of oldest views that only free cells (`doubt_solids`)."""
     _flown: Places = field(init=False)
     _flown_m: list[float] = field(init=False)
     """Radius around each of these points [m]."""
@@ -82,6 +84,7 @@ class Space:
         self._corner = np.floor(self.centre_w / CELL_M).astype(int) - SIDE // 2
         self._views = deque(maxlen=MAX_VIEWS)
         self._flown, self._flown_m = Places(size=3), []
+        self._doubted = 0
         self._way = np.zeros((SIDE, SIDE), np.uint8)
         self._contacts = Places(size=3)
 
@@ -91,7 +94,9 @@ class Space:
         small = _smaller(view)
         if len(self._views) >= _MAX_SAME and _same_view(self._views[-_MAX_SAME], small):
             self._views[-1] = small
+            self._doubted = min(self._doubted, len(self._views) - 1)
         else:
+            self._doubted -= int(len(self._views) == MAX_VIEWS and self._doubted > 0)
             self._views.append(small)
         self._add(small)
 
@@ -139,18 +144,25 @@ class Space:
         self._build()
 
     def forget_before(self, seen_s: float) -> None:
-        """Drop everything but the views since a time, and contacts: no view shows what was felt."""
+        """Drop everything but the views since a time."""
         kept = [view for view in self._views if view.stamp_s >= seen_s]
+        self._doubted = max(0, self._doubted - (len(self._views) - len(kept)))
         self._views = deque(kept, maxlen=MAX_VIEWS)
         self._flown, self._flown_m = Places(size=3), []
+        self._contacts = Places(size=3)
         self._build()
 
     def _build(self) -> None:
         self._odds[:], self._way[:] = 0.0, 0
-        for view in self._views:
-            self._add(view)
+        for k, view in enumerate(self._views):
+            self._add(view, fills=k >= self._doubted)
         for p_w, radius_m in zip(self._flown.p_w, self._flown_m, strict=True):
             self._pass(p_w, radius_m)
+
+    def doubt_solids(self) -> None:
+        """Reset occupied cells to unknown until they are observed again; free cells and contacts stay."""
+        self._odds[self._odds > 0.0] = 0.0
+        self._doubted = len(self._views)
 
     def layer(self, height_m: float, half_m: float) -> Layer:
         """Slice for flight at a height; a cell is free if all cells within ``half_m`` above and below are."""
@@ -172,10 +184,11 @@ class Space:
             raise ValueError(f"heights {low_m:.2f} to {high_m:.2f} m are outside the grid of {LEVELS * CELL_M:.1f} m")
         return np.asarray((self._odds[:, :, low:high] > SOLID).mean(2) >= share)
 
-    def _add(self, view: View) -> None:
+    def _add(self, view: View, fills: bool = True) -> None:
         depth = np.where(np.isfinite(view.depth_m) & (view.depth_m > 0), view.depth_m, 0.0).astype(np.float32)
         self._carve(view, depth)
-        self._fill(view, depth)
+        if fills:
+            self._fill(view, depth)
 
     def _carve(self, view: View, depth: FloatArray) -> None:
         """Free the cells that lie wholly in front of the depth of all pixels that they cover."""

@@ -48,3 +48,8 @@ def test_goals_that_do_also_beyond_what_is_known(goal):
 def test_drones_that_should_not_rise(allowed, battery, guessed, words):
     with pytest.raises(FlightRefused, match=words):
         check_fit(allowed, battery, LIMITS, guessed)
+
+
+def test_a_fit_drone_may_rise():
+    check_fit(True, 0.5, LIMITS, False)
+    check_fit(True, float("nan"), LIMITS, False)

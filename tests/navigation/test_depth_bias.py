@@ -25,6 +25,10 @@ def knows(rng, ratio=0.8, unit_m=1.0, pictures=20):
     return usual
 
 
+def test_fit_yields_the_depth_ratio_for_any_slope(rng):
+    assert fit(rng, 0.8).ratio_log == pytest.approx(np.log(0.8), abs=0.05)
+
+
 def test_bias_line_is_in_map_units(rng):
     usual = knows(rng, unit_m=2.0)
     for unit_m in (2.0, 0.5):
@@ -71,6 +75,14 @@ def test_a_second_of_outliers_puts_the_scale_in_doubt(rng):
     for _ in range(5):
         usual.is_consistent(fit(rng, 0.8 / 4.0), 1.0, sure=True)
     assert usual.doubt == pytest.approx(0.75, rel=0.1), "too short as well as too long"
+
+
+def test_an_inlier_resets_the_outlier_count(rng):
+    usual = knows(rng)
+    for _ in range(3):
+        for _ in range(60):
+            assert not usual.is_consistent(fit(rng, 2.4), 1.0, sure=True)
+        assert usual.is_consistent(fit(rng, 0.8), 1.0, sure=True)
 
 
 def test_wall_points_do_not_correct_the_room_behind_the_door(rng):

@@ -4,9 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from views import moved
 
 from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.map_views import MapViews
 from edgeslam_torch.navigation.openings.depth_rays import DepthRays
 from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
 from edgeslam_torch.navigation.openings.exits import openings
@@ -91,6 +93,14 @@ def test_no_hypothesis_behind_the_camera_or_far_away():
     assert watch.candidates == ()
 
 
+@pytest.mark.parametrize("tilt_deg", [60.0, 90.0])
+def test_a_camera_that_looks_at_the_floor_has_no_level_ray(tilt_deg):
+    T = looking(0.5, 0.0, 0.0, tilt_rad=math.radians(tilt_deg))
+    if tilt_deg == 90.0:
+        T[2, :3] = 0.0, 0.0, -1.0  # to the last bit
+    assert seen(walls(), picture(T, (-0.45, 0.45), 2.0)) == []
+
+
 def test_two_hypotheses_make_a_candidate_but_no_exit():
     watch, T = ExitTracker(), looking(0.5, 0.0, 0.0)
     view = picture(T, (-0.45, 0.45), 2.0)
@@ -106,3 +116,17 @@ def test_two_hypotheses_make_a_candidate_but_no_exit():
         watch.look(walls(free_beyond=True), DroneState(0.5 * k, here, 0.0, np.zeros(3), view=view))
     assert len(watch.exits) == 1
     assert watch.candidates == (), "it is one now"
+
+
+def test_hypotheses_follow_map_corrections():
+    watch, T, views = ExitTracker(), looking(0.5, 0.0, 0.0), MapViews()
+    views.add(0, np.eye(4))
+    for k in range(3):
+        here, view = np.array([0.5, 0.0, HEIGHT_M]), picture(T, (-0.45, 0.45), 2.0)
+        watch.look(walls(), DroneState(0.5 * k, here, 0.0, np.zeros(3), view=view, views=views))
+    away = np.eye(4)
+    away[1, 3] = 1.0
+    views.correct(moved(0, away))
+    watch.look(walls((0.55, 1.45)), DroneState(2.0, np.array([0.5, 1.0, HEIGHT_M]), 0.0, np.zeros(3)))
+    (candidate,) = watch.candidates
+    assert candidate.centre_w == pytest.approx([2.0, 1.0], abs=0.12)

@@ -93,6 +93,14 @@ def test_door_frame_does_not_correct_the_room_behind_it(rng, ratio):
     assert sigma[:, :50].max() < 0.2
 
 
+def test_a_fit_of_another_picture_is_its_line_alone(rng):
+    uv, residual, shape = half_seen(rng, -0.4)
+    fit = NearFit(np.log(0.5), 1.0, 0.03, len(uv), uv, np.zeros(len(uv)), residual).alone()
+    metres = fit.applied(DepthMap(np.full(shape, 2.0, np.float32), np.full(shape, 0.1, np.float32)))
+    np.testing.assert_allclose(metres.depth_m, 1.0, rtol=1e-4)
+    assert metres.sigma_log.min() >= 0.29
+
+
 def test_nearer_points_bring_depth_nearer(rng):
     uv, residual, shape = half_seen(rng, np.log(0.6))
     metres = NearFit(0.0, 1.0, 0.3, len(uv), uv, np.full(len(uv), LEVEL), residual).applied(

@@ -24,11 +24,26 @@ def test_a_point_before_the_wall_is_taken_and_is_sure():
     assert (np.delete(told.sigma_log.ravel(), 45 * 120 + 60) == np.float32(0.3)).all()
 
 
+def test_the_nearest_of_the_points_in_a_pixel_counts():
+    assert with_nearer_points(WALL, np.repeat(AT, 3, 0), np.array([1.2, 0.7, 0.9])).depth_m[45, 60] == np.float32(0.7)
+
+
+def test_nearer_network_depth_is_kept():
+    told = with_nearer_points(WALL, AT, np.array([5.0]))
+    assert (told.depth_m == 3.0).all() and (told.sigma_log == np.float32(0.3)).all()
+
+
 def test_points_fill_unknown_network_depth():
     unknown = DepthMap(np.full((90, 120), np.nan, np.float32), np.full((90, 120), np.nan, np.float32))
     told = with_nearer_points(unknown, AT, np.array([2.0]))
     assert told.depth_m[45, 60] == pytest.approx(2.0) and np.isfinite(told.sigma_log[45, 60])
     assert np.isnan(told.depth_m).sum() == 90 * 120 - 1
+
+
+def test_a_map_without_points_changes_nothing():
+    none = np.zeros((0, 2)), np.zeros(0)
+    assert len(agreeing(*none, 120)) == 0
+    assert (with_nearer_points(WALL, *none).depth_m == 3.0).all()
 
 
 def test_points_agree_when_there_are_enough_in_one_place():

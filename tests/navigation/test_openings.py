@@ -5,15 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from views import longer
+from views import longer, moved
 
 from edgeslam_torch.navigation.drone_state import DroneState, View
+from edgeslam_torch.navigation.exploring.frontiers import Looks, reachable
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import MapUpdate, MapViews
+from edgeslam_torch.navigation.openings.detour import has_detour
 from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
-from edgeslam_torch.navigation.openings.exits import has_detour, openings
+from edgeslam_torch.navigation.openings.exits import openings
 from edgeslam_torch.navigation.openings.pathways import pathways
-from edgeslam_torch.navigation.openings.wall_frame import Walls, along_walls
+from edgeslam_torch.navigation.openings.wall_frame import Walls, along_walls, wall_directions
 from edgeslam_torch.navigation.pilot import Pilot
 from edgeslam_torch.navigation.skills.explore import Explore
 from edgeslam_torch.navigation.skills.go_to import GoTo
@@ -152,6 +154,11 @@ def test_one_viewpoint_makes_a_candidate_two_an_exit():
     assert watched([0.0] * 8, surroundings(PILLARS)).candidates == (), "what can be passed by"
 
 
+def test_its_normal_keeps_its_side_when_the_drone_has_flown_through():
+    (exit_,) = watched([0.0, 0.6, 1.2, 2.8, 3.4], surroundings(wall(0.9))).exits
+    assert exit_.normal_w[0] == pytest.approx(1.0, abs=0.05)
+
+
 def test_its_sigma_has_that_of_the_metres():
     walls, watch = surroundings(wall(0.9)), ExitTracker()
     for k, x in enumerate([0.0, 0.2, 0.4, 0.6]):
@@ -159,6 +166,13 @@ def test_its_sigma_has_that_of_the_metres():
     (exit_,) = watch.exits
     assert exit_.position_sigma_m == pytest.approx(0.2 * 1.4, rel=0.25)
     assert exit_.width_sigma_m > 0.17
+
+
+def test_an_opening_that_closes_under_closer_looks_is_forgotten():
+    watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
+    for k in range(12):
+        watch.look(surroundings(wall(0.0)), state(0.6, stamp_s=5.0 + 0.5 * k))
+    assert watch.exits == ()
 
 
 def test_exit_is_withdrawn_after_consecutive_misses():
@@ -251,6 +265,14 @@ def test_views_of_a_partly_open_door_do_not_lower_its_odds():
     assert len(watch.exits) == 1
 
 
+def test_what_is_open_in_part_is_a_candidate_after_two_looks():
+    walls = smeared()
+    assert watched([0.0], walls).candidates == ()
+    watch = watched([0.0, 0.2, 0.4, 0.6, 0.8], walls)
+    assert watch.exits == ()
+    assert [c.centre_w for c in watch.candidates] == [pytest.approx([2.0, 0.0], abs=0.3)]
+
+
 @pytest.mark.parametrize("angle", ANGLES)
 @pytest.mark.parametrize(
     ("solid", "unseen", "detour"),
@@ -292,6 +314,14 @@ def test_ten_seconds_with_a_detour_outweigh_views_without_one():
         watch.look(door, state(0.6, stamp_s=66.0 + 0.5 * k))
         assert watch.exits == (), "a moment later a speck closes the way round"
     watch.look(door, state(0.6, stamp_s=71.0))
+    assert len(watch.exits) == 1
+
+
+def test_a_way_round_that_comes_and_goes_takes_back_no_door():
+    door, pillars = surroundings(wall(0.9)), surroundings(PILLARS)
+    watch = watched([0.0, 0.2, 0.4, 0.6] * 3, door)
+    for k in range(60):
+        watch.look(pillars if k % 2 else door, state(0.6, stamp_s=10.0 + 0.5 * k))
     assert len(watch.exits) == 1
 
 
@@ -349,6 +379,28 @@ def test_a_room_is_no_pathway():
     assert pathways(surroundings(lambda a, b: np.maximum(np.abs(a), np.abs(b)) > 2.5), HERE) == []
 
 
+def test_without_walls_there_is_no_direction():
+    assert wall_directions(surroundings(lambda a, b: np.zeros(a.shape, bool)), HERE) == []
+
+
+def test_what_is_looked_at_in_vain_is_left():
+    looks, layer = Looks(), surroundings(lambda a, b: np.zeros(a.shape, bool)).layer
+    near, far = layer.cells(np.array([[0.5, 0.0]])), layer.cells(np.array([[4.0, 0.0]]))
+    both = np.concatenate([near, far])
+    for k in range(12):
+        kept = looks.worth(both, layer, state(0.0, stamp_s=0.5 * k))
+    assert kept.tolist() == far.tolist()
+    assert not looks.over(100.0)
+    looks.worth(near, layer, state(0.0, stamp_s=6.0))
+    assert not looks.over(18.0) and looks.over(20.0)
+
+
+def test_what_a_wall_parts_is_not_reachable():
+    layer = surroundings(lambda a, b: np.abs(a - 2.0) < 0.1).layer
+    cells = layer.cells(np.array([[1.0, 0.0], [4.0, 0.0]]))
+    assert reachable(cells, layer, HERE).tolist() == cells[:1].tolist()
+
+
 def test_upright_is_what_fills_the_height():
     space = Space()
     for z in np.arange(0.05, 2.3, 0.1):
@@ -378,6 +430,32 @@ def test_an_exit_stays_where_its_pictures_stay():
     assert [e.centre_w[:2] for e in watch.exits] == [pytest.approx([2.0, 0.0], abs=0.15)]
 
 
+def test_exits_go_along_with_the_map():
+    """Its metres become twice as long and the map turns square to the left about the origin."""
+    views = MapViews()
+    views.add(0, np.eye(4))
+    watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)), views)
+    after = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    views.correct(moved(0, after, 1.3))
+    unseen = surroundings(lambda a, b: np.zeros(a.shape, bool), lambda a, b: np.ones(a.shape, bool))
+    watch.look(unseen, state(0.0, stamp_s=3.0, yaw=-2.0))
+    (exit_,) = watch.exits
+    assert exit_.centre_w[:2] == pytest.approx([0.0, 2.6], abs=0.15)
+    assert exit_.normal_w[:2] == pytest.approx([0.0, 1.0], abs=0.1)
+    assert exit_.width_m == pytest.approx(1.17, abs=0.2)
+
+
+def test_a_revised_unit_drops_exits_without_a_view():
+    pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
+    pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
+    pilot.update(state(0.0, stamp_s=9.0))
+    assert len(pilot.exits.exits) <= 1
+    waits = pilot.update(replace(state(0.0, stamp_s=9.1), revision=1))
+    assert pilot.exits.exits and "revised" in waits.why and not any(waits.sticks())
+    pilot.update(replace(state(0.0, stamp_s=10.2), revision=1))
+    assert pilot.exits.exits == ()
+
+
 def test_a_revised_unit_keeps_exits_tied_to_a_view():
     pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
     pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)), pilot.views)
@@ -388,12 +466,28 @@ def test_a_revised_unit_keeps_exits_tied_to_a_view():
     assert [e.centre_w[0] for e in pilot.exits.exits] == [pytest.approx(2.4, abs=0.15)]
 
 
-def test_the_pilot_looks_at_undecided_openings(monkeypatch):
+def test_the_pilot_takes_what_is_low_for_no_wall():
+    """Two rows of points at x = 1 and 2 m: the first up to 2 m, the second around the height of flight alone."""
+    pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
+    for y in np.arange(-0.95, 1.0, 0.1):
+        for z in np.arange(0.05, 2.0, 0.1):
+            pilot.space.mark(np.array([[1.05, y, z]]))
+        pilot.space.mark(np.array([[2.05, y, 1.15], [2.05, y, 1.05]]))
+    walls = pilot.walls()
+    first, second = (tuple(walls.layer.cells(np.array([x, 0.05]))) for x in (1.05, 2.05))
+    assert walls.layer.solid[first] and walls.layer.solid[second]
+    assert walls.upright[first] and not walls.upright[second]
+
+
+def test_the_pilot_passes_candidates_to_its_skill(monkeypatch):
     monkeypatch.setattr(Pilot, "walls", lambda self: surroundings(wall(0.9)))
-    pilot = Pilot(Explore())
+    task = Explore()
+    pilot = Pilot(task)
     pilot.exits = watched([0.0] * 8, surroundings(wall(0.9)))
     pilot.update(state(0.0, stamp_s=9.0, view=VIEW))
-    assert pilot.exits.candidates and pilot._views.openings == pilot.exits.candidates
+    assert pilot.exits.candidates
+    assert task.look_rad(state(1.0, stamp_s=9.1)) is not None, "it looks around first"
+    assert len(task.goals(surroundings(wall(0.9)).layer, state(-1.0, stamp_s=9.2)))
 
 
 def test_the_pilot_passes_exits_to_its_skill(monkeypatch):
@@ -401,7 +495,7 @@ def test_the_pilot_passes_exits_to_its_skill(monkeypatch):
     told = []
 
     class Listens(GoTo):
-        def consider(self, exits):
+        def consider(self, candidates, exits=()):
             told.extend(exits)
 
     pilot = Pilot(Listens(np.array([3.0, 0.0, 1.15])))

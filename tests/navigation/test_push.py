@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.navigation.contact import Push
+from edgeslam_torch.navigation.contact.push import Push
 from edgeslam_torch.navigation.drone_state import DroneState
 
 AHEAD = np.array([1.0, 0.0])
@@ -55,6 +55,10 @@ def test_moving_is_no_contact(velocities_w, reported_m_s):
 def test_to_and_fro_is_no_push():
     """A second in each direction: no command lasts long enough."""
     assert held_after_s(lambda k: (0.0, 0.0), lambda k: 0.0, lambda k: AHEAD * (-1.0) ** (k // 20)) is None
+
+
+def test_a_pause_begins_it_anew():
+    assert held_after_s(lambda k: (0.0, 0.0), lambda k: 0.0, lambda k: None if k % 25 == 24 else AHEAD) is None
 
 
 def test_a_pause_resets_the_detection():

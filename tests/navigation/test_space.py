@@ -21,6 +21,10 @@ def cell(layer, x, y):
     return bool(layer.free[i, j]), bool(layer.solid[i, j])
 
 
+def test_unknown_space_is_not_free():
+    assert not Space().layer(1.15, 0.15).free.any()
+
+
 def test_wall_is_occupied_front_free_back_unknown():
     layer = seen(Space())
     assert cell(layer, 1.55, 0.05) == (True, False)
@@ -124,6 +128,19 @@ def test_grid_follows_map_corrections():
     assert not cell(layer, 0.55, 0.05)[0]
 
 
+def test_grid_follows_scale_changes():
+    """Metres of 2 m become 1.5 times as long: the wall is 3 m away, and a place flown through 1 m to the side 1.5 m."""
+    space = Space()
+    seen(space)
+    space.flown(np.array([0.0, 1.0, 1.15]), 0.2)
+    space.correct(moved(0, facing_a_wall().T_w_c, 1.5))
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 2.55, 0.05) == (True, False)
+    assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
+    layer = space.layer(1.15, 0.05)
+    assert cell(layer, 0.05, 1.55)[0] and not cell(layer, 0.05, 1.05)[0]
+
+
 def test_redundant_views_are_dropped():
     space = Space()
     for k in range(300):
@@ -133,6 +150,22 @@ def test_redundant_views_are_dropped():
     assert cell(layer, 0.75, 0.05) == (True, False) and cell(layer, 1.55, 0.05) == (True, False)
 
 
+def test_reset_wall_stays_unknown_until_observed_again():
+    """The space in front stays free, the wall is not freed."""
+    space, there = Space(), facing_a_wall(x=1.0).T_w_c
+    seen(space)
+    space.doubt_solids()
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 1.55, 0.05) == (True, False) and not layer.solid.any() and not cell(layer, 2.05, 0.05)[0]
+    space.correct(moved(0, there))
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 2.55, 0.05) == (True, False) and not layer.solid.any()
+    layer = seen(space, x=1.0, picture=1)
+    assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
+    space.correct(longer(1.0))
+    assert space.layer(1.15, 0.15).solid.any(), "what was seen again stays"
+
+
 def test_grid_follows_the_drone():
     space = Space()
     before = cell(seen(space), 1.55, 0.05)
@@ -140,6 +173,14 @@ def test_grid_follows_the_drone():
     layer = space.layer(1.15, 0.15)
     assert layer.corner_w[0] == pytest.approx(-8.0 + 4.0)
     assert cell(layer, 1.55, 0.05) == before
+
+
+def test_points_of_the_map_are_solid():
+    space = Space()
+    seen(space)
+    space.mark(np.array([[1.05, 0.05, 1.15]]))
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 1.05, 0.05) == (False, True)
 
 
 def test_unknown_depth_changes_nothing():
@@ -175,6 +216,22 @@ def test_contact_stays_occupied():
     assert cell(layer, 1.05, 0.25) == (True, False), "not beside it"
 
 
+def test_contacts_follow_map_corrections():
+    space, shifted = Space(), np.eye(4)
+    space.map_views.add(0, np.eye(4))
+    space.add_contact(Contact(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
+    shifted[:3, 3] = [1.0, 2.0, 0.0]
+    space.correct(moved(0, shifted))
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 2.22, 2.05)[1] and not cell(layer, 1.22, 0.05)[1]
+
+
+def test_contact_outside_the_grid_is_ignored():
+    space = Space()
+    space.add_contact(Contact(np.array([100.0, 0.0, 1.15]), np.array([1.0, 0.0])), 0.17)
+    assert not space.layer(1.15, 0.15).solid.any()
+
+
 def test_path_flown_follows_grid_and_map():
     """Within a cell of it; after metres have become twice as long, twice as far away."""
     space = Space()
@@ -189,7 +246,7 @@ def test_path_flown_follows_grid_and_map():
     assert not space.was_at(np.array([50.0, 0.0]))
 
 
-def test_older_views_can_be_dropped_and_contacts_stay():
+def test_older_views_and_contacts_can_be_dropped():
     space = Space()
     for stamp_s, yaw in ((1.0, 0.0), (1.2, 0.0), (1.4, 0.0), (5.0, np.pi / 2), (5.2, np.pi / 2), (5.4, np.pi / 2)):
         space.observe(replace(facing_a_wall(yaw=yaw), stamp_s=stamp_s))
@@ -200,6 +257,5 @@ def test_older_views_can_be_dropped_and_contacts_stay():
     space.forget_before(5.0)
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 0.05, 1.55) == (True, False)
-    for x, y in ((1.55, 0.05), (2.05, 0.05), (-3.0, 0.0)):
+    for x, y in ((1.55, 0.05), (2.05, 0.05), (-3.0, 0.0), (0.0, -2.3)):
         assert cell(layer, x, y) == (False, False)
-    assert cell(layer, 0.0, -2.3) == (False, True)

@@ -149,6 +149,16 @@ def test_backing_up_speed_is_dithered():
     assert sum(speeds) / len(speeds) == pytest.approx(0.25, abs=0.01)
 
 
+def test_backing_up_avoids_velocities_below_the_quantisation_step():
+    """A few centimetres beside the path it does not creep back, which telemetry would report as standing."""
+    supervisor = Supervisor()
+    flown(supervisor, 3.0)
+    aside = {"p_w": np.array([0.975, 0.03, 1.1]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
+    lost = flown(supervisor, 4.0, lambda s: replace(s, **aside), begin_s=3.0)
+    backing = [o.command for o in lost if o.command.why.endswith("back up along the path flown")]
+    assert backing and all(command.left_m_s == 0.0 and command.forward_m_s < -0.15 for command in backing)
+
+
 def test_tracking_loss_in_a_turn_turns_back():
     """It turned left from 0, and lost the map at 45 degrees: it turns right again, back to what it saw before."""
     supervisor = Supervisor()
@@ -245,6 +255,13 @@ def test_heights_are_kept():
     assert math.isclose(flown(Supervisor(limits), 0.5, command=VelocityCommand(up_m_s=0.3))[-1].command.up_m_s, 0.3)
 
 
+def test_uncertain_scale_lands_later():
+    orders = flown(Supervisor(), UNSURE_LAND_S + 1.0, lambda s: replace(s, metric=False, p_w=np.array([0.0, 0.0, 1.1])))
+    assert not any(o.land for o in orders[: round(20 * UNSURE_LAND_S) - 1]) and orders[-1].land
+    up = [o.command.up_m_s for o in orders[:-30]]
+    assert min(up) < 0 < max(up) and abs(sum(up)) < 41 * max(up), "up and down about where it was"
+
+
 def test_stale_frame_after_uncertain_scale_does_not_land_at_once():
     supervisor = Supervisor()
     flown(supervisor, 12.0, lambda s: replace(s, scale_sigma=0.3))
@@ -309,6 +326,18 @@ def test_blocked_way_back_is_given_up_and_reported():
     (contact,) = [o.contact for o in lost if o.contact is not None]
     np.testing.assert_allclose(contact.towards_w, [-1.0, 0.0], atol=0.2)
     assert not any(o.land for o in lost)
+
+
+def test_scale_change_is_no_dead_reckoned_distance():
+    """Carried by half a metre, which become a whole one: it backs up by 2 m, in 8 s, not by 3.5."""
+    supervisor = Supervisor()
+    flown(supervisor, 2.0)
+    flown(supervisor, 1.0, lambda s: replace(s, tracked=False, position_sigma_m=0.1), begin_s=2.0, x=1.0)
+    supervisor.views.correct(longer(2.0))
+    there = {"p_w": np.array([2.95, 0.0, 2.2]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
+    lost = flown(supervisor, 11.0, lambda s: replace(s, **there), command=VelocityCommand(), begin_s=3.0)
+    backing = [o.command.why.endswith("back up along the path flown") for o in lost]
+    assert sum(backing) / 20 == pytest.approx(8.0, abs=0.3)
 
 
 def test_way_back_follows_map_corrections():

@@ -1,0 +1,1 @@
+"""Obstruction of the flight: contact with unseen obstacles, and places of repeated tracking loss."""

@@ -1,0 +1,1 @@
+"""Exploration: frontiers, coverage by the camera, and second looks at candidate openings."""
