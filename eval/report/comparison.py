@@ -1,9 +1,11 @@
 """``comparison.html``: two runs side by side, one self-contained page without scripts or paths."""
 
+import base64
 import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +20,7 @@ from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.types import FloatArray
 
 COLOURS = ("var(--tracked)", "var(--predicted)")
+_LETTERS = "AB"
 _HEAD = ("", "A", "B", "B \u2212 A")
 _NONE = "\u2013"
 _MIN_COMMON = 10
@@ -53,7 +56,7 @@ def write_comparison(
     if first.exists() and second.exists() and first.samefile(second):
         raise EvaluationError(f"{first}: given twice; a comparison needs two runs")
     sides = []
-    for folder, letter in zip((first, second), "AB", strict=True):
+    for folder, letter in zip((first, second), _LETTERS, strict=True):
         run = open_run(folder)
         score, truth = judge_run(run, groundtruth, judge_map)
         positions = run.trajectory.positions @ upright(run.trajectory, score, truth).T
@@ -64,21 +67,13 @@ def write_comparison(
 
 def _page(sides: Sequence[_Side]) -> str:
     title = html.escape(" and ".join(side.title for side in sides))
-    stories = [
-        f'<div><h2><i class="mark" style="background:{colour}"></i>{html.escape(side.title)}</h2>'
-        f"<p>{html.escape(words.story(side.run, side.score))}</p></div>"
-        for side, colour in zip(sides, COLOURS, strict=True)
-    ]
-    settings = [_settings(side.run) for side in sides]
-    names = dict.fromkeys([*settings[0], *settings[1]])
-    differ = [[name, *(of.get(name, _NONE) for of in settings)] for name in names]
     body = [
         f'<header class="wrap"><p class="eyebrow">EdgeSLAM-Torch, two runs</p><h1>{title}</h1></header>',
-        f'<section class="wrap two">{"".join(stories)}</section>',
+        f'<section class="wrap two">{"".join(map(_about, range(2), sides))}</section>',
         f'<section class="wrap"><h2>Figures</h2>{_table(_HEAD, _figures(sides))}</section>',
         f'<section class="wrap"><h2>Paths</h2>{_paths(sides)}</section>',
-        '<section class="wrap"><h2>Settings that differ</h2>',
-        f'<div class="words">{_table(_HEAD[:3], [row for row in differ if row[1] != row[2]])}</div></section>',
+        _different("Settings that differ", *(_settings(side.run) for side in sides)),
+        _different("Other values that differ", *(_values(side.run) for side in sides)),
     ]
     style = "".join((TEMPLATE / name).read_text(encoding="utf-8") for name in ("style.css", "comparison.css"))
     return (
@@ -87,6 +82,20 @@ def _page(sides: Sequence[_Side]) -> str:
         f'<meta name="color-scheme" content="light dark"><title>{title}</title><link rel="icon" href="data:,">'
         f"<style>{style}</style></head><body>{''.join(body)}"
         '<footer class="wrap"><p>Made by EdgeSLAM-Torch. Each run has its own report.</p></footer></body></html>\n'
+    )
+
+
+def _about(index: int, side: _Side) -> str:
+    """Story, warnings and picture of one run."""
+    said = "".join(f"<li>{html.escape(text)}</li>" for text in words.warnings(side.run.summary))
+    picture, shown = side.run.path / "map.png", ""
+    if picture.is_file():
+        data = base64.b64encode(picture.read_bytes()).decode("ascii")
+        shown = f'<img alt="Map of {html.escape(side.title)}" src="data:image/png;base64,{data}">'
+    mark = f'<i class="mark" style="background:{COLOURS[index]}"></i>'
+    return (
+        f"<div><h2>{mark}{html.escape(side.title)}</h2><p>{html.escape(words.story(side.run, side.score))}</p>"
+        f'<ul class="warnings">{said}</ul>{shown}</div>'
     )
 
 
@@ -105,29 +114,36 @@ def _figures(sides: Sequence[_Side]) -> list[list[str]]:
 
 
 def _paths(sides: Sequence[_Side]) -> str:
-    """Both paths from above and from the side: one is aligned to the other, which is metric if either is, by their
-    common frames; each is drawn alone without enough of them, or if one stood still."""
-    units = [words.unit(side.run) for side in sides]
-    still = 1 if units == ["units", "m"] else 0
+    """Both paths from above and from the side, and how far they are apart over time.
+
+    One is aligned to the other, which is metric if either is, by their common frames; each is drawn alone without
+    enough of them, or if one stood still.
+    """
+    still = 1 if words.unit(sides[0].run) != "m" and words.unit(sides[1].run) == "m" else 0
     there, moving = sides[still], sides[1 - still]
-    i, j = match(there.run.trajectory.stamps_s, moving.run.trajectory.stamps_s)
+    stamps, unit = there.run.trajectory.stamps_s, words.unit(there.run)
+    i, j = match(stamps, moving.run.trajectory.stamps_s)
     try:
         found = umeyama(moving.positions[j], there.positions[i])
     except EvaluationError:
         found = Alignment(degenerate=True)
     if len(i) < _MIN_COMMON or found.degenerate or not found.scale > 0:
         note = "The runs have no frames in common (or stood still), so each path is drawn in its own world."
-        drawn = [_views([side.positions], [COLOURS[k]], units[k]) for k, side in enumerate(sides)]
-        return f'<p class="note">{note}</p>{"".join(drawn)}'
+        drawn = "".join(_views([side.positions], [COLOURS[k]], words.unit(side.run)) for k, side in enumerate(sides))
+        return f'<p class="note">{note}</p>{drawn}'
     moved = found.points(moving.positions)
     apart = np.linalg.norm(moved[j] - there.positions[i], axis=1)
     note = (
-        f"{'AB'[1 - still]} is aligned to {'AB'[still]} by {len(i)} common frames (rotated, translated, scaled by "
-        f"{found.scale:.4g}); the remaining distance is {float(np.sqrt(np.mean(apart**2))):.3g} {units[still]} RMS, "
-        f"{float(apart.max()):.3g} {units[still]} at most."
+        f"{_LETTERS[1 - still]} is aligned to {_LETTERS[still]} by {len(i)} common frames (rotated, translated, scaled "
+        f"by {found.scale:.4g}); the remaining distance is {float(np.sqrt(np.mean(apart**2))):.3g} {unit} RMS, "
+        f"{float(apart.max()):.3g} {unit} at most."
     )
+    chart = line_drawings.chart(stamps[i] - stamps[0], apart, "var(--accent)", f"apart [{unit}]")
     paths = [moved, there.positions] if still else [there.positions, moved]
-    return f'<p class="note">{note}</p>{_views(paths, COLOURS, units[still])}'
+    return (
+        f'<p class="note">{note}</p>{_views(paths, COLOURS, unit)}'
+        f'<figure><figcaption>Distance over time</figcaption><div class="scroll">{chart}</div></figure>'
+    )
 
 
 def _views(paths: Sequence[FloatArray], colours: Sequence[str], unit: str) -> str:
@@ -150,7 +166,21 @@ def _settings(run: RunFolder) -> dict[str, str]:
     return out
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def _values(run: RunFolder) -> dict[str, str]:
+    """``summary.json`` without what the figures contain."""
+    shown = ("source: ", "fps", "cpu", "peak", "stage", "step", "warnings", "pieces", "map: ", "losses: ")
+    return {name: value for name, value in words.flat_rows(run.summary) if not name.startswith(shown)}
+
+
+def _different(heading: str, a: dict[str, str], b: dict[str, str]) -> str:
+    names = list(dict.fromkeys([*a, *b]))
+    rows = [[name, a.get(name, _NONE), b.get(name, _NONE)] for name in names if a.get(name) != b.get(name)]
+    if not rows:
+        return f'<section class="wrap"><h2>{heading}</h2><p class="note">None.</p></section>'
+    return f'<section class="wrap"><h2>{heading}</h2><div class="words">{_table(["", "A", "B"], rows)}</div></section>'
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     first = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
     rest = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     return f'<div class="scroll"><table><tr>{first}</tr>{rest}</table></div>'

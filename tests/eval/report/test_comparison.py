@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from browser import PROGRAM, Browser
 
 from edgeslam_torch import cli
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory, write_tum
@@ -83,6 +84,12 @@ def test_one_path_is_aligned_to_the_other(two, tmp_path):
     assert found[1] == "200" and float(found[2]) == pytest.approx(0.5, abs=1e-3) and float(found[3]) < 1e-6
 
 
+def test_runs_without_common_frames_are_drawn_apart(two, tmp_path):
+    run = read_trajectory(two[1] / "trajectory.txt")
+    write_tum(Trajectory(run.stamps_s + 1e6, run.T_w_c, "b"), two[1] / "trajectory.txt")
+    assert "no frames in common" in Cells(write_comparison(*two, tmp_path / "c.html")).text
+
+
 def test_page_may_be_passed_on(two, tmp_path):
     page = write_comparison(*two, tmp_path / "c.html").read_text()
     assert str(tmp_path) not in page and "secret" not in page
@@ -120,3 +127,17 @@ def test_drawing_keeps_shape_and_direction():
     assert -up[1] == pytest.approx(right[0] / 2, abs=0.1)  # SVG's y points down
     bar = re.search(r"h([\d.]+)\".*>([\d.]+) m<", drawn)
     assert bar is not None and float(bar[1]) / float(bar[2]) == pytest.approx(right[0] / 2, rel=1e-2)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(PROGRAM is None, reason="no chromium here")
+def test_page_in_a_browser(two, tmp_path):
+    page = write_comparison(*two, tmp_path / "c.html")
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(page)
+        wide = "document.documentElement.scrollWidth > innerWidth + 1"
+        assert browser.run(f"({{wide: {wide}, lines: document.querySelectorAll('polyline').length}})") == {
+            "wide": False,
+            "lines": 5,
+        }
+        assert browser.errors == []

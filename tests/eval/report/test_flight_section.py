@@ -35,3 +35,8 @@ def test_exits_are_drawn_from_jamb_to_jamb(tmp_path):
 def test_no_flight_no_section(lines, tmp_path):
     assert written(tmp_path, lines) == ""
     assert flight_section(None) == "" == flight_section(tmp_path / "none")
+
+
+def test_flight_without_clearance_shows_its_way(tmp_path):
+    page = written(tmp_path, ["1,0,0,nan,a,,w\n", "2,3,4,nan,a,,w\n"])
+    assert "5.0 m by its own map" in page and page.count("<svg") == 1

@@ -113,6 +113,13 @@ def test_story_has_the_runs_own_figures(run, summary, told):
     assert all(text in story for text in told), story
 
 
+def test_warnings_of_the_run_stand_under_its_story(run):
+    said = ["telemetry's velocities are not used", "the video froze </script>"]
+    file = write_report(with_summary(run, warnings=said))
+    assert Page(file).data["warnings"] == said
+    assert '<ul id="warnings"' in file.read_text(encoding="utf-8")
+
+
 def test_page_tells_nothing_about_the_disk(run):
     secret = "/home/Jane Doe/projects"
     with_summary(
