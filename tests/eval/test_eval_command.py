@@ -111,3 +111,54 @@ def test_depth_maps_are_judged_by_name(tmp_path, capsys):
     assert run(eval_command, *words) == 0
     assert row(capsys.readouterr().out, "metric")["AbsRel"] == "0.1000"
     assert json.loads((tmp_path / "d.json").read_text())[str(tmp_path / "ours")]["median_scaled"]["delta1"] == 1.0
+
+
+def test_one_broken_run_does_not_hide_the_others(run_folder, tmp_path, capsys):
+    truth = run_folder(tmp_path / "a")
+    (tmp_path / "empty.txt").write_text("")
+    assert run(eval_command, tmp_path / "empty.txt", tmp_path / "a", "--groundtruth", truth) == 1
+    out, err = capsys.readouterr()
+    assert "\na  " in out and "empty.txt" in err
+
+
+def test_peers_are_compared_on_common_frames_and_told_apart(run_folder, tmp_path, capsys):
+    truth = run_folder(tmp_path / "a")
+    (tmp_path / "peer").mkdir()
+    rows = (tmp_path / "a" / "trajectory.txt").read_text().splitlines(keepends=True)
+    (tmp_path / "peer" / "a").write_text("".join(rows[81:]))
+    assert run(eval_command, tmp_path / "a", tmp_path / "peer" / "a", "--groundtruth", truth, "--common-frames") == 0
+    text = capsys.readouterr().out
+    assert "On the 120 frames that all 2 have" in text
+    common = [line.split()[:2] for line in text.split("On the 120")[1].splitlines()]
+    assert [str(tmp_path / "peer" / "a"), "120"] in common and [str(tmp_path / "a"), "200"] in common
+
+
+def test_scale_interval_of_the_run_is_checked(run_folder, tmp_path):
+    truth = run_folder(tmp_path / "a")
+    run_folder(tmp_path / "b", scale=1.2)  # says 3 %, is 20 % off
+    assert evaluate_run(tmp_path / "a", truth).scale_inside_95 is True
+    assert evaluate_run(tmp_path / "b", truth).scale_inside_95 is False
+
+
+@pytest.mark.parametrize("what", ["missing", "file", "no ground truth"])
+def test_wrong_folders_get_one_line(what, run_folder, tmp_path):
+    truth = run_folder(tmp_path / "a")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(EdgeSlamError) as caught:
+        if what == "missing":
+            run(eval_command, tmp_path / "none", "--groundtruth", truth)
+        elif what == "file":
+            run(report_command, truth)
+        else:
+            run(eval_command, tmp_path / "a", "--groundtruth", tmp_path / "empty")
+    assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
+
+
+def test_report_says_how_the_run_went(run_folder, tmp_path):
+    truth = run_folder(tmp_path / "a")
+    assert run(report_command, tmp_path / "a", "--groundtruth", truth) == 0
+    page = (tmp_path / "a" / "report.html").read_text(encoding="utf-8")
+    assert "98.5\\u00a0% of the frames were tracked against the map, from the first on" in page
+    assert "lost once" in page and "few matches (7)" in page
+    assert "(7) </script>" not in page, "text of the run must not end the page's script"
+    assert "{{" not in page.split("<script")[0]

@@ -266,3 +266,28 @@ def test_every_exported_map_says_whether_z_is_up(run_folder, tmp_path, capsys, f
     assert main(["export-map", str(tmp_path / "run"), "--format", form, "-o", str(tmp_path / "out")]) == 0
     assert said in capsys.readouterr().out
     assert said.encode() in (tmp_path / "out" / file if file else tmp_path / "out").read_bytes()[:10000]
+
+
+def test_plyfile_reads_what_was_written(cloud, tmp_path):
+    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed")
+    write_ply(tmp_path / "m.ply", cloud)
+    found = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
+    np.testing.assert_array_equal(np.stack([found[k] for k in "xyz"], axis=1), cloud.p_w)
+    np.testing.assert_array_equal(np.stack([found[k] for k in ("red", "green", "blue")], axis=1), cloud.colour)
+    np.testing.assert_array_equal(found["sigma"], cloud.sigma_m)
+    np.testing.assert_array_equal(found["observations"], cloud.observations)
+
+
+def test_sight_above_the_heights_frees_nothing():
+    wall = wall_at(2.0)
+    lamps = wall + [0.0, 0.0, 2.0]  # seen at 45 degrees upwards: the ray leaves the heights half a metre ahead
+    grid = occupancy_grid(np.concatenate([wall, lamps]), seen_from((0.0, 0.0, 1.0), lamps), np.array([[0.0, 0.0, 1.0]]))
+    assert value_at(grid, 0.35, 0.0) == FREE
+    assert value_at(grid, 1.0, 0.0) == UNKNOWN
+
+
+def test_run_without_observations_has_points_without_images(run_folder, tmp_path, capsys):
+    run_folder(tmp_path / "a")
+    save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
+    assert export(tmp_path / "a", "--format", "colmap") == 0
+    assert "points are not linked to images" in capsys.readouterr().out

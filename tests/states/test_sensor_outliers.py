@@ -106,9 +106,9 @@ def test_a_prediction_prevents_a_mismatch_on_a_repetitive_wall(turns):
 def test_wrong_sensors_do_not_change_a_pose_that_images_confirm():
     flight = panels().first(16)
     lie = PoseEstimate(se3.exp(np.array([0.3, -0.5, 0.4, 0.1, 0.1, 0.1])), 0.01, 0.005)
-    lied, untold = flown(flight, lambda fusion, stamp_s: lie), flown(flight)
-    assert not untold[-1].reason
-    assert [out.status for out in lied] == [out.status for out in untold]
-    for a, b in zip(lied, untold, strict=True):
+    lied, alone = flown(flight, lambda fusion, stamp_s: lie), flown(flight)
+    assert not alone[-1].reason
+    assert [out.status for out in lied] == [out.status for out in alone]
+    for a, b in zip(lied, alone, strict=True):
         np.testing.assert_allclose(a.T_w_c, b.T_w_c, atol=2e-3)
     assert "contradicted" in lied[-1].reason

@@ -156,3 +156,22 @@ def test_hook_that_is_none_is_an_error_of_one_line(tmp_path, monkeypatch, name):
     )
     with pytest.raises(ConfigError, match=f"^--hook {name}: [^\n]*$"):
         named_hooks([name])
+
+
+def test_hook_that_only_watches_changes_nothing(tmp_path):
+    alone, watched = run(tmp_path / "a"), run(tmp_path / "b", Diary())
+    for a, b in zip(alone.network.parameters(), watched.network.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_examples_do_what_they_say(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = ("OwnLoss", "CsvLog", "SampleImages", "stop")
+    hooks = named_hooks([f"{EXAMPLES}:{name}" for name in names])
+    hooks[2].every, hooks[3].metric, hooks[3].below = 2, "abs_rel", 0.4
+    state = run(tmp_path / "out", *hooks)
+    assert (state.step, state.stop) == (2, "abs_rel is below 0.4")
+    rows = [row.split(",") for row in Path("losses.csv").read_text().split()]
+    assert [row[0] for row in rows] == ["1"] * 4 + ["2"] * 4
+    assert "supervised/smooth" in {row[1] for row in rows}
+    assert sorted(path.name for path in Path("samples").iterdir()) == ["000002-0.png", "000002-1.png"]

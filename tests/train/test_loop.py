@@ -13,17 +13,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from small_depth import METADATA
+from small_depth import METADATA, SmallDepth
 from small_depth import small_depth as network
 
 from edgeslam_torch.errors import ConfigError, SourceError, WeightsError
+from edgeslam_torch.models.checkpoint import build_network
+from edgeslam_torch.models.fastdepth import Variant, Widths
+from edgeslam_torch.models.weights_file import read_header
 from edgeslam_torch.train import loop
 from edgeslam_torch.train import state as state_file
 from edgeslam_torch.train.hooks import Hooks
-from edgeslam_torch.train.loop import DivergedError, NonFiniteLossError, train
+from edgeslam_torch.train.loop import DivergedError, NonFiniteLossError, learning_rate_factor, train
 from edgeslam_torch.train.processes.device import Arithmetic
 from edgeslam_torch.train.processes.loading import WorkerError
-from edgeslam_torch.train.signals import Slot, Source, Supervised
+from edgeslam_torch.train.signals import Slot, Source, Supervised, SupervisedWeights
 from edgeslam_torch.train.state import TrainConfig, saved_step
 from edgeslam_torch.train.validate import image_tensor
 from edgeslam_torch.train.views.augment import AugmentConfig, View
@@ -474,3 +477,49 @@ def test_stop_that_one_process_asks_for_ends_all_after_the_same_step(tmp_path):
     for code, said in in_two_processes(STOPPED, str(tmp_path / "out")):
         assert code == 0
         assert "asked for by the second at 2" in said
+
+
+def test_interrupt_in_the_validation_is_validated_after_the_resume(whole, tmp_path):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(network(), METADATA, [signal()], CONFIG, tmp_path / "stopped", interrupted)
+    assert saved_step(tmp_path / "stopped" / "last.pt") == 3
+    assert_same(whole, run(tmp_path / "stopped"))
+
+
+def test_state_of_another_network_is_named(tmp_path):
+    run(tmp_path)
+    with pytest.raises(WeightsError, match=r"last\.pt: .*another network"):
+        train(SmallDepth(width=16), METADATA, [signal()], CONFIG, tmp_path)
+
+
+def test_finished_run_is_not_trained_further(tmp_path):
+    run(tmp_path)
+    before = (tmp_path / "final.safetensors").read_bytes()
+    assert run(tmp_path).step == 6
+    assert (tmp_path / "final.safetensors").read_bytes() == before
+    assert read_header(tmp_path / "final.safetensors") == METADATA
+
+
+@pytest.mark.slow
+def test_one_batch_is_learnt_almost_to_zero(tmp_path):
+    weights = SupervisedWeights(uncertainty=0.0, gradient=0.1)
+    one = Supervised([Source("one", views(1), 1.0)], METADATA, STILL, weights)
+    torch.manual_seed(0)
+    wide = build_network(fast := replace(METADATA, variant=Variant.SKIPADD.value), Widths((8,) + (16,) * 13, (16,) * 5))
+    config = TrainConfig(steps=250, batch=1, lr=2e-2, encoder_lr=5e-3, frozen_stages=0, warmup_steps=10, weight_decay=0)
+    record = At()
+    train(wide, fast, [one], config, tmp_path, hooks=[record])
+    losses = [named["supervised/l1"] for named in record.losses]
+    assert losses[0] > 0.5
+    assert np.mean(losses[-20:]) < 0.03
+
+
+def test_learning_rate_rises_then_falls():
+    factors = [learning_rate_factor(i, TrainConfig(steps=100, warmup_steps=10)) for i in range(100)]
+    assert factors[0] == pytest.approx(0.1)
+    assert max(factors) == factors[9] == pytest.approx(1.0)
+    assert factors[-1] == pytest.approx(0.01, abs=0.002)
+    assert all(a >= b for a, b in zip(factors[9:], factors[10:], strict=False))

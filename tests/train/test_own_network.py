@@ -14,7 +14,7 @@ from edgeslam_torch.models.checkpoint import restored, save_checkpoint
 from edgeslam_torch.models.onnx.export import ExportOptions, export_onnx
 from edgeslam_torch.models.record import OTHER_NETWORK, Metadata
 from edgeslam_torch.models.trainable import DepthModule, Prediction
-from edgeslam_torch.train import Data, Existing, TrainConfig, finetune, load_depth_folder, out_folder
+from edgeslam_torch.train import Data, Existing, TrainConfig, finetune, load_depth_folder, load_run, out_folder
 from edgeslam_torch.train.validate import score
 
 METADATA = Metadata(
@@ -85,3 +85,12 @@ def test_tensors_of_another_network_are_refused(tmp_path):
         restored(nn.Conv2d(3, 1, 3), tmp_path / "w.safetensors")
     with pytest.raises(WeightsError, match="cannot read"):
         restored(Rows(), tmp_path / "none.safetensors")
+
+
+@pytest.mark.slow
+def test_another_network_learns_from_a_run_by_the_sweep(run_folder, tmp_path):
+    """Nothing but poses and map points: the network's own depth only fills what the sweep leaves open."""
+    torch.manual_seed(0)
+    outcome = taught(Rows(), Data(posed=[load_run(run_folder)]), tmp_path / "out")
+    assert outcome.before is not None and outcome.kept is not None
+    assert outcome.kept.abs_rel_scaled < 0.6 * outcome.before.abs_rel_scaled

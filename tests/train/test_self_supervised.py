@@ -1,5 +1,6 @@
 """Self-supervision from a SLAM run, on a rendered room with known poses and depth."""
 
+import json
 from contextlib import contextmanager
 from dataclasses import replace
 from unittest import mock
@@ -8,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from posed_run import CAMERA, world
+from posed_run import CAMERA, FRAMES, world
 from small_depth import RUNS, narrow_fastdepth
 
 from edgeslam_torch.errors import SourceError
@@ -197,3 +198,42 @@ def test_finetune_command_runs_the_slam_on_a_flight(tmp_path, capsys):
     assert "posed images without depth" in capsys.readouterr().out
     assert is_run_folder(out / "slam" / "flight")
     assert "flight" in load_checkpoint(out / "final.safetensors")[1].data
+
+
+def test_run_is_read_with_poses_points_and_partners(run_folder, sequence):
+    assert is_run_folder(run_folder)
+    assert not is_run_folder(run_folder.parent)
+    assert len(sequence.views) == FRAMES - 1, "the lost frame is left out"
+    assert sequence.metric
+    assert len(sequence.usable) == len(sequence.views)
+    assert all(i not in partners for i, partners in enumerate(sequence.partners))
+    assert min(len(v.z) for v in sequence.views) > 100
+
+
+def test_missing_recording_is_named(run_folder, tmp_path):
+    for name in ("trajectory.txt", "anchors.ply", "camera.yaml"):
+        (tmp_path / name).write_bytes((run_folder / name).read_bytes())
+    (tmp_path / "summary.json").write_text(json.dumps({"source": {"path": str(tmp_path / "gone")}}))
+    with pytest.raises(SourceError, match="gone"):
+        load_run(tmp_path)
+
+
+def test_batch_follows_the_slot_alone(sequence):
+    signal = SelfSupervised([sequence], RUNS)
+    both, names = signal.draw([Slot(1, 7, 0), Slot(1, 7, 1)])
+    second, name = signal.draw([Slot(1, 7, 1)])
+    assert torch.equal(both["rgb_i"][1:], second["rgb_i"])
+    assert torch.equal(both["image"][1::2], second["image"])
+    assert names[1:] == name and name[0].startswith("run/0.")
+
+
+def test_gradient_reaches_the_network(sequence):
+    network = narrow_fastdepth()
+    signal = SelfSupervised([sequence], RUNS)
+    batch, _ = signal.draw([Slot(0, 0, 0)])
+    losses = signal.losses(network.predict(batch["image"]), batch)
+    assert set(losses) == {"photometric", "points", "cycle", "lshape", "smooth", "uncertainty"}
+    sum(v.sum() for v in losses.values()).backward()
+    grads = [p.grad for p in network.parameters() if p.grad is not None]
+    assert grads
+    assert all(torch.isfinite(g).all() for g in grads)

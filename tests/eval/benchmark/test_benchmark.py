@@ -8,9 +8,10 @@ import pytest
 from markdown_rows import rows
 
 from edgeslam_torch.commands.judging import bench
-from edgeslam_torch.eval.benchmark.benchmark import BenchSettings, markdown_bench, sequences
+from edgeslam_torch.eval.benchmark.benchmark import BenchSettings, figures_of, markdown_bench, sequences
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.figures import read_record
+from edgeslam_torch.eval.metrics.run_score import evaluate_run
 
 
 def record(ate, **conditions):
@@ -81,3 +82,10 @@ def test_synthetic_flight_is_run_once_and_judged(tmp_path, capsys, monkeypatch):
     assert run["figures"]["cpu_ms_per_frame"] > within  # start-up counts
     assert run_bench(*words) == 0
     assert json.loads((tmp_path / "bench" / "bench.json").read_text())["runs"] == [run]
+
+
+def test_figures_are_plain_numbers(run_folder, tmp_path):
+    truth = run_folder(tmp_path / "a")
+    found = figures_of(evaluate_run(tmp_path / "a", truth))
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert found["ate_sim3_m"] is not None and found["cpu_ms_per_frame"] == 33.1

@@ -2,7 +2,7 @@
 
 import pytest
 
-from edgeslam_torch.eval.experiment.figures import Figure, changes, markdown_comparison
+from edgeslam_torch.eval.experiment.figures import Figure, changes, grouped, markdown_comparison
 
 ATE = Figure("ate", "ATE", floor=0.03, one_seed=0.10)
 SHARE = Figure("share", "share", floor=0.01, relative=False, lower_is_better=False)
@@ -37,3 +37,9 @@ def test_comparison_has_a_line_a_name_and_says_what_is_missing():
     lines = markdown_comparison({"a": runs(1.0), "b": runs(1.0)}, {"a": runs(2.0), "c": runs(1.0)}, [ATE]).splitlines()
     assert "1.0000 -> 2.0000 x2.00 !" in lines[2]
     assert any("b, c" in line for line in lines) and any(line.endswith("a ATE x2.00") for line in lines)
+
+
+def test_runs_are_grouped_in_their_order():
+    found = grouped([{"cell": "b", "k": 0}, {"cell": "a", "k": 1}, {"cell": "b", "k": 2}], "cell")
+    assert {name: [run["k"] for run in group] for name, group in found.items()} == {"b": [0, 2], "a": [1]}
+    assert list(found) == ["b", "a"]

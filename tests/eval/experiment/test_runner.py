@@ -112,3 +112,16 @@ def test_a_process_stores_what_the_named_function_returns_or_says_why_not(tmp_pa
     assert (None if result is None else result["value"]) == found
     assert capsys.readouterr().err == ("" if found else "a negative value\n")
     assert Task(tmp_path, "case", f"{__name__}:doubled", {"value": value + 1}).result() is None
+
+
+def test_variants_follow_their_recording_and_simulations_come_last(tmp_path):
+    names = ["flight/room", "desk/half_rate", "wood", "none/black", "desk"]
+    record = run(tmp_path, names, Starter(), jobs=5)
+    assert [row["cell"] for row in record["rows"]] == ["desk", "desk/half_rate", "wood", "flight/room", "none/black"]
+
+
+def test_record_holds_what_earlier_calls_left(tmp_path):
+    starter = Starter()
+    run(tmp_path, ["a"], starter)
+    assert [row["cell"] for row in run(tmp_path, ["b"], starter)["rows"]] == ["a", "b"]
+    assert [row["cell"] for row in run(tmp_path, ["b"], starter, commit="def")["rows"]] == ["b"]

@@ -268,3 +268,16 @@ def test_positions_that_are_none_are_left_out(number, tmp_path):
     path.write_text("".join(f"{i} {number} 0 0 0 0 0 1\n" for i in range(9)))
     with pytest.raises(EvaluationError, match="every pose"):
         read_trajectory(path)
+
+
+def test_reversed_time_is_sorted_and_said(tmp_path):
+    found = read_trajectory(tum(tmp_path / "t.txt", GOOD[::-1]))
+    assert found.positions[:, 0].tolist() == [0.0, 1.0, 2.0]
+    assert "backwards" in found.notes[0]
+
+
+@pytest.mark.parametrize("digits", [0, 1])
+def test_rounded_stamps_are_named_as_the_cause(digits, loop, tmp_path):
+    rows = [f"{t:.{digits}f} {x} {y} {z} 0 0 0 1" for t, (x, y, z) in zip(loop.stamps_s, loop.positions, strict=True)]
+    with pytest.raises(EvaluationError, match="digits"):
+        read_trajectory(tum(tmp_path / "t.txt", rows))

@@ -7,7 +7,7 @@ from markdown_rows import row, rows
 from edgeslam_torch.cli import main
 from edgeslam_torch.eval.experiment.runner import Task
 from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, corridor_ends, right_exits
-from edgeslam_torch.eval.judge.navigation.flight import fly, shortest_m
+from edgeslam_torch.eval.judge.navigation.flight import fly, shortest_m, true_layer
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.eval.judge.navigation.table import judge_flights, markdown
 from edgeslam_torch.navigation.limits import NavLimits
@@ -111,3 +111,23 @@ def test_a_hung_planner_ends_on_the_floor_without_contact():
     found = fly(Case("blank_walls", 0, "hung"))
     assert not found.reached and found.landed and found.contacts == 0
     assert "planner" in " ".join(found.dangers)
+
+
+def test_true_free_space_is_that_of_the_solids():
+    site = named_site("l_corridor", 0)
+    layer = true_layer(site, NavLimits())
+    for x, y in ((0.0, 0.0), (3.0, 0.0)):
+        assert layer.free[tuple(layer.cells(np.array([x, y])))]
+    assert layer.solid[tuple(layer.cells(np.array([2.0, 3.0])))]
+
+
+def test_exits_have_a_table_of_their_own():
+    text = markdown([flown(True, exits=[2, 2, 1]), flown(True, exits=[1, 0, 0]), flown(True)])
+    assert ["goto", "truth", "3", "2", "1 (9 to 91 %)", "1 (6 to 79 %)"] in rows(text)
+    assert "precision" not in markdown([flown(True)])
+
+
+@pytest.mark.slow
+def test_by_the_true_pose_it_follows_a_corridor_round_its_corner():
+    found = fly(Case("l_corridor", 1, behaviour="corridor"))
+    assert found.reached and found.contacts == 0

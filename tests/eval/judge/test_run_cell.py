@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rendered import CAMERA, film, sideways, stairs_world
 
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import find_recordings, open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory, write_tum
@@ -206,3 +207,32 @@ def test_a_cut_shows_one_world_and_then_the_next(recording, tmp_path, monkeypatc
     assert [f.index for f in frames] == list(range(8))
     assert np.diff([f.stamp_s for f in frames]) == pytest.approx(0.05)
     assert source.telemetry == [] and source.length == 8 and truth.poses is None
+
+
+def test_cell_that_cannot_run_says_why(tmp_path):
+    with pytest.raises(SourceError, match="no such file or folder"):
+        run(tmp_path, Cell("gone", 0, str(tmp_path / "gone")))
+
+
+@pytest.mark.parametrize("kind", ["noise", "black", pytest.param("frozen", marks=pytest.mark.slow)])
+def test_nothing_to_see_is_a_source_like_any_other(kind):
+    source = flights.nothing_to_see(kind, 1)
+    frames = [next(frames) for frames in [source.frames()] for _ in range(2)]
+    same = np.array_equal(frames[0].image, frames[1].image)
+    assert same == (kind != "noise")
+    assert frames[0].image.any() == (kind != "black")
+    assert frames[0].image.shape == (480, 640, 3) and source.length == flights.NONE_FRAMES
+
+
+@pytest.mark.slow
+def test_a_further_flight_through_the_building_takes_off_from_the_same_place(tmp_path, monkeypatch):
+    monkeypatch.setitem(COURSES, "building", replace(COURSES["building"], seconds=6.0, rate_hz=2.0))
+    flights.record_once(tmp_path / "again", "building", 0, 1)
+    first = flights.flown(COURSES["building"], 0)[1].T_w_c[:, :3, 3]
+    apart = np.linalg.norm(open_dataset(tmp_path / "again").truth.positions - first, axis=1)
+    assert apart[0] < 0.05 and apart.max() > 0.1
+
+
+def test_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(EvaluationError, match="no such folder of recordings"):
+        list_cells(tmp_path / "gone", "base", [0])

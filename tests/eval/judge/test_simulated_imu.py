@@ -30,3 +30,11 @@ def test_only_readings_that_do_not_turn_with_the_camera_are_faulty(drawn, kind):
     check = checked_against_rotation(readings, known, T_S, drawn.truth.T_w_c[:, :3, :3])
     assert (model.T_imu_cam is None) == kind.endswith("unknown")
     assert check.known and bool(check.fault) == (kind in ("degrees", "permuted", "other_flight"))
+
+
+def test_faults_of_the_readings(drawn):
+    assert np.diff(IMU_KINDS["gaps"](drawn)[1].stamps_s).max() > 0.4
+    force = IMU_KINDS["clipped"](drawn)[1].acceleration_m_s2
+    assert (np.abs(force) == np.abs(force).max()).sum() > 50
+    again = IMU_KINDS["mpu6050"](drawn)[1]
+    assert again.acceleration_m_s2.tobytes() == IMU_KINDS["mpu6050"](drawn)[1].acceleration_m_s2.tobytes()

@@ -7,6 +7,7 @@ from edgeslam_torch.eval.judge import sources
 from edgeslam_torch.eval.judge.cells import VARIANTS, Variant
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
+from edgeslam_torch.readers.layouts import read_sequence
 from edgeslam_torch.readers.source import open_source
 
 CAMERA = Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
@@ -66,3 +67,23 @@ def test_a_perturbation_is_drawn_by_the_seed_and_far_below_a_pixel(numbered):
     moves = [abs(getattr(one.camera, k) - getattr(CAMERA, k)) for one in (first, second) for k in names]
     assert min(moves) > 0.0 and max(moves) < 0.05
     assert first.camera != second.camera and variant.applied_to(numbered, 1).camera == first.camera
+
+
+@pytest.mark.parametrize(
+    ("order", "numbers", "stamps"),
+    [
+        (sources.backwards, [2, 1, 0], [1.0, 1.2, 1.3]),
+        (lambda t: sources.cut(t, [[0, 2], [2, 3], [0, 2]]), [0, 1, 2, 0, 1], [1.0, 1.15, 1.3, 1.45, 1.6]),
+    ],
+)
+def test_images_in_another_order_are_numbered_and_stamped_anew(tmp_path, write_images, order, numbers, stamps):
+    names = ["1.000000.png", "1.100000.png", "1.300000.png"]
+    write_images(tmp_path / "rgb", names, (64, 48))
+    (tmp_path / "rgb.txt").write_text("".join(f"{n[:-4]} rgb/{n}\n" for n in names))
+    save_camera(tmp_path / "camera.yaml", CAMERA)
+    images = read_sequence(tmp_path).images
+    played = order(np.array([image.stamp_s for image in images]))
+    frames = list(sources.reordered(open_source(tmp_path), images, *played).frames())
+    assert [f.path.name for f in frames] == [names[k] for k in numbers]
+    assert [f.index for f in frames] == list(range(len(numbers)))
+    assert [f.stamp_s for f in frames] == pytest.approx(stamps)

@@ -4,6 +4,8 @@ import pytest
 from markdown_rows import row as cells_of
 
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.experiment.figures import compared
+from edgeslam_torch.eval.judge.score import COLUMNS
 from edgeslam_torch.eval.judge.table import markdown, read_thresholds, verdicts
 
 
@@ -80,3 +82,20 @@ def test_table_shows_medians_bars_and_failures(thresholds):
     assert "- desk/half_rate seed 0: no result: killed by signal 9" in text
     assert cells_of(text, "wood")["thresholds"] == "-"
     assert "0 of 2 cells with thresholds pass" in text
+
+
+def test_records_are_shown_side_by_side():
+    before = record(row("desk", ate_m=0.01, losses=0.0), row("old", ate_m=0.1), commit="one")
+    after = record(row("desk", ate_m=0.02, losses=0.0), row("new", ate_m=0.1), commit="two")
+    text = compared(before, after, "rows", "cell", COLUMNS)
+    assert "one -> two" in text
+    assert cells_of(text, "desk")["ATE"] == "0.0100 -> 0.0200 x2.00 !"
+    assert cells_of(text, "desk")["lost"] == "0 -> 0"
+    assert "only in one of the two: new, old" in text
+    assert "worse: desk ATE x2.00" in text
+
+
+def test_cell_that_fails_now_counts_as_worse():
+    before, after = record(row("desk", ate_m=0.01)), record(row("desk", error="crashed"))
+    text = compared(before, after, "rows", "cell", COLUMNS)
+    assert cells_of(text, "desk")["ATE"] == "0.0100 -> - !"

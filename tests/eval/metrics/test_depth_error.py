@@ -8,6 +8,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.metrics.depth_error import (
     compare_folders,
     compare_with_recording,
+    mean_score,
     report_depth,
     score_depth,
 )
@@ -106,3 +107,16 @@ def test_fastdepth_sample_scores_as_computed_directly(data_dir):
     assert found["metric"].abs_rel == pytest.approx(0.14049818, abs=1e-6)
     assert found["metric"].delta1 == pytest.approx(0.77726403, abs=1e-6)
     assert found["edges_metric"].pixels > 1000
+
+
+def test_median_scaling_removes_a_factor(rng):
+    truth = rng.uniform(1.0, 5.0, (20, 30))
+    found = score_depth(0.4 * truth, truth, median_scaled=True)
+    assert found.scale == pytest.approx(2.5)
+    assert found.abs_rel == pytest.approx(0.0, abs=1e-12)
+    assert score_depth(0.4 * truth, truth).delta1 == 0.0
+
+
+def test_mean_is_over_maps():
+    a, b = score_depth(np.full((2, 2), 1.2), np.ones((2, 2))), score_depth(np.full((9, 9), 1.1), np.ones((9, 9)))
+    assert mean_score([a, b]).abs_rel == pytest.approx(0.15)

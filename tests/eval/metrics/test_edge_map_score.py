@@ -122,3 +122,31 @@ def test_depth_is_registered_to_another_camera():
     filled = np.flatnonzero(moved[60] > 0)
     assert filled.max() == pytest.approx(159 - shift, abs=1.0)
     assert T_COLOUR_DEPTH[0, 3] == pytest.approx(-0.028, abs=1e-3)
+
+
+def test_half_the_edges_make_half_the_completeness(truth):
+    outline = board_outline()
+    found = score_map(outline[outline[:, 0] < 0], Alignment(), truth)
+    assert found.completeness[0.02] < 0.65
+    assert 0.4 < found.completeness[0.06] < 0.65
+    assert found.accuracy[0.06] == 1.0
+
+
+def test_map_follows_the_trajectorys_alignment(truth):
+    found = score_map(board_outline() / 2.0 - [0, 0, 1.0], Alignment(scale=2.0, t=np.array([0.0, 0.0, 2.0])), truth)
+    assert found.median_m < 0.015
+
+
+def test_data_set_without_depth_is_refused(folder, tmp_path):
+    (tmp_path / "groundtruth.txt").write_text((folder / "groundtruth.txt").read_text())
+    with pytest.raises(EvaluationError, match="no depth maps"):
+        build_surface(open_dataset(tmp_path))
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_measured_surface_of_a_recording_is_its_own_best_map(data_dir):
+    truth = build_surface(open_dataset(data_dir / "tum_fr1_xyz"))
+    found = score_map(truth.edges_w, Alignment(), truth)
+    assert found.truth_edges > 5000
+    assert found.median_m < 0.005 and found.completeness[0.02] == 1.0

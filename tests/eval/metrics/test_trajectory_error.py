@@ -9,7 +9,7 @@ from markdown_rows import rows
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.associate import associate, on_one_clock
+from edgeslam_torch.eval.inputs.associate import associate, match, on_one_clock
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.eval.metrics.align import AlignmentKind, umeyama
 from edgeslam_torch.eval.metrics.diagnose import explain
@@ -365,3 +365,35 @@ def test_keyframes_and_other_clocks_are_compared_too(loop, early_mistake):
 def test_runs_with_nothing_in_common_are_named(loop):
     with pytest.raises(EvaluationError, match="a, b: 0 frame"):
         score_common(loop, [("a", loop.take(slice(0, 50))), ("b", loop.take(slice(100, 150)))])
+
+
+def test_umeyama_never_mirrors(rng):
+    p = rng.normal(size=(30, 3))
+    found = umeyama(p, p * [1.0, 1.0, -1.0])
+    assert np.linalg.det(found.R) == pytest.approx(1.0)
+
+
+def test_each_pose_of_the_shorter_list_gets_its_nearest():
+    truth, estimate = np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.11, 0.29, 5.0])
+    i, j = match(truth, estimate, 0.02)
+    assert i.tolist() == [1, 3] and j.tolist() == [0, 1]
+    i, j = match(estimate, truth, 0.02)
+    assert i.tolist() == [0, 1] and j.tolist() == [1, 3]
+
+
+def test_a_camera_that_only_shifts_has_orientations(loop, rng):
+    jitter = Rotation.from_rotvec(rng.normal(0.0, 0.003, (len(loop), 3))).as_matrix()
+    assert score_trajectory(turned(loop, np.eye(3)), turned(noisy(loop, rng), jitter)).rotation_deg.rmse < 2.0
+
+
+def test_late_stamps_are_measured(loop, rng):
+    estimate = noisy(loop, rng)
+    text = findings(loop, replace(estimate, stamps_s=estimate.stamps_s + 1.37))
+    found = re.search(r"--offset (-[\d.]+)", text)
+    assert found is not None and float(found.group(1)) == pytest.approx(-1.37, abs=0.025)  # half a frame
+
+
+def test_no_offset_is_offered_for_another_shape(loop):
+    with pytest.raises(EvaluationError) as caught:
+        score_trajectory(loop, replace(at(loop, walked(loop)), stamps_s=loop.stamps_s + 300.0))
+    assert "fit best" not in str(caught.value)

@@ -8,8 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch import demo
 from edgeslam_torch.readers.source import open_source
-from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ
+from edgeslam_torch.synthetic.flights.courses import BLOCK_M, COURSES, LOW_LIGHT, RATE_HZ, simulated_camera
+from edgeslam_torch.synthetic.flights.degrade import degraded
 from edgeslam_torch.synthetic.flights.flight import FlightPlan
+from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.sites.build import place
 
 
@@ -93,3 +95,24 @@ def test_a_flight_with_an_imu_is_read_with_its_mount(tmp_path):
     assert source.imu.rate_hz == pytest.approx(200) and len(source.imu_readings) == 175
     force_w = source.imu_readings.acceleration_m_s2.mean(axis=0) @ flight.T_w_b[:, :3, :3].mean(axis=0).T
     assert force_w == pytest.approx([0.0, 0.0, 9.81], abs=1.0)
+
+
+def test_a_flight_along_a_rectangle_turns_at_its_corners():
+    _, flight = flight_of("block")
+    p = flight.T_w_b[:, :2, 3]
+    outer = np.abs(p) - 0.5 * np.array(BLOCK_M)
+    assert np.abs(outer.max(axis=1)).max() < 0.5, "on one side or the other"
+    heading = np.arctan2(flight.T_w_b[:, 1, 0], flight.T_w_b[:, 0, 0])
+    way = np.arctan2(flight.velocity_w[:, 1], flight.velocity_w[:, 0])
+    fast = np.linalg.norm(flight.velocity_w[:, :2], axis=1) > 0.3
+    off = np.abs((heading - way + np.pi) % (2 * np.pi) - np.pi)[fast]
+    assert np.degrees(np.percentile(off, 95)) < 35.0, "it looks where it flies"
+
+
+def test_low_light_is_dark_and_noisy(rng):
+    world, flight = flight_of("low_light")
+    view = render(world, simulated_camera(160, 120), flight.T_w_c[0])
+    day = degraded(rng, view.image, view.depth_m, simulated_camera(160, 120), COURSES["room"].faults)
+    night = degraded(rng, view.image, view.depth_m, simulated_camera(160, 120), LOW_LIGHT)
+    assert night.mean() == pytest.approx(0.2 * day.mean(), rel=0.1)
+    assert night.max() < 70

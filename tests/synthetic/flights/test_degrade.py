@@ -6,9 +6,12 @@ import pytest
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.flights.degrade import (
     CLEAN,
+    CameraFaults,
     degraded,
+    with_brightness,
     with_motion_blur,
     with_noise,
+    with_vignetting,
 )
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
@@ -44,3 +47,22 @@ def test_motion_blur_smears_along_the_motion_by_its_length():
     assert abs(changed.mean() - 79.5) < 0.6  # exposure is centred on the stamp
     across = with_motion_blur(step_image(), DEPTH, CAMERA, np.array([0, 1.0, 0, 0, 0, 0]), 0.1)
     np.testing.assert_array_equal(across[20:100], step_image()[20:100])
+
+
+def test_brightness_follows_the_gain():
+    image = np.array([[[0, 100, 255]]], np.uint8)
+    np.testing.assert_array_equal(with_brightness(image, 1.2)[0, 0], [0, 120, 255])
+
+
+def test_vignetting_darkens_the_corners_only():
+    image = np.full((121, 161, 3), 200, np.uint8)
+    out = with_vignetting(image, 0.3)
+    assert out[60, 80, 0] == 200
+    assert float(out[0, 0, 0]) == pytest.approx(140, abs=3)
+
+
+def test_impossible_faults_are_refused():
+    with pytest.raises(ValueError, match="must not be negative"):
+        CameraFaults(read_noise=-1.0)
+    with pytest.raises(ValueError, match="gain positive"):
+        CameraFaults(gain=0.0)

@@ -47,3 +47,14 @@ def test_twist_carries_one_pose_to_the_next(flight):
     k, dt = 400, 2 / 30
     there = flight.T_w_c[k - 1] @ se3.exp(flight.twist_c(k) * dt)
     np.testing.assert_allclose(there, flight.T_w_c[k + 1], atol=1e-9)
+
+
+def test_flight_starts_low_and_climbs(flight):
+    z = flight.T_w_b[:, 2, 3]
+    assert z[0] == pytest.approx(0.4, abs=0.02)
+    assert 0.7 < z[150:].min() < z.max() < 1.7
+
+
+def test_flight_without_air_is_refused(home):
+    with pytest.raises(ValueError, match="free air"):
+        fly(np.random.default_rng(0), home, 30, inspect, plan=FlightPlan(clearance_m=4.0))

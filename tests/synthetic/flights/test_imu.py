@@ -73,3 +73,20 @@ def test_noise_and_bias_walk_have_the_stated_densities(model):
         steps = np.diff(means, axis=0).std()
         # Difference of the means of two successive intervals: white noise, and two thirds of the walk over one.
         assert steps == pytest.approx(np.sqrt(2 * density**2 / 5.0 + 2 / 3 * walk**2 * 5.0), rel=0.2)
+
+
+def test_readings_are_the_same_for_a_seed_and_clipped_at_the_range():
+    errors = ImuErrors(accelerometer_range_m_s2=9.8)
+    a, b = (simulate_imu(np.random.default_rng(2), *still(), MPU6050, errors=errors) for _ in range(2))
+    assert a.acceleration_m_s2.tobytes() == b.acceleration_m_s2.tobytes()
+    assert a.acceleration_m_s2.max() == 9.8
+
+
+def test_noisy_poses_are_smoothed(rng):
+    stamps_s, T = still(20.0)
+    T[:, :3, 3] += 1e-3 * rng.standard_normal((len(T), 3))
+    T[:, :3, :3] = T[:, :3, :3] @ Rotation.from_rotvec(2e-3 * rng.standard_normal((len(T), 3))).as_matrix()
+    readings = simulate_imu(rng, stamps_s, T, MPU6050, errors=EXACT, knots_s=0.2)
+    inside = slice(100, -100)
+    assert np.abs(readings.acceleration_m_s2[inside] - [0, 0, 9.81]).max() < 0.5
+    assert np.abs(readings.angular_rate_rad_s[inside]).max() < 0.05

@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.readers.telemetry_csv import read_telemetry
 from edgeslam_torch.synthetic.flights.flight import fly
 from edgeslam_torch.synthetic.flights.paths import inspect
-from edgeslam_torch.synthetic.flights.telemetry import EXACT, FIELDS, simulate
+from edgeslam_torch.synthetic.flights.telemetry import EXACT, FIELDS, TelemetryFaults, simulate
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
 
 
@@ -91,3 +92,28 @@ def test_drift_grows_as_the_battery_drains():
             ends.append(v.sum() * 0.1)
         spread.append(np.std(ends))
     assert spread[1] > 1.8 * spread[0]
+
+
+def test_loss_drops_packets(flight):
+    log = simulated(flight, TelemetryFaults(loss=0.3))
+    assert 0.6 < len(log.stamps_s) / len(simulated(flight).stamps_s) < 0.8
+    assert np.all(np.diff(log.stamps_s) >= 0)
+
+
+def test_telemetry_needs_increasing_stamps(flight):
+    with pytest.raises(ValueError, match="increasing stamps"):
+        simulate(np.random.default_rng(0), flight.stamps_s[:3], flight.T_w_c[:3], flight.T_b_c)
+    with pytest.raises(ValueError, match="increasing stamps"):
+        simulate(np.random.default_rng(0), np.zeros(900), flight.T_w_c, flight.T_b_c)
+
+
+def test_csv_reader_agrees_with_our_own_conversion(tmp_path, flight):
+    log = simulated(flight, TelemetryFaults())
+    log.write(tmp_path / "telemetry.csv")
+    for read, own in zip(read_telemetry(tmp_path / "telemetry.csv")[0], log.samples(), strict=True):
+        np.testing.assert_allclose(read.velocity_m_s, own.velocity_m_s, atol=1e-9)
+        np.testing.assert_allclose(read.rpy_rad, own.rpy_rad, atol=1e-9)
+        np.testing.assert_allclose(read.acceleration_m_s2, own.acceleration_m_s2, rtol=1e-3, atol=1e-6)
+        assert read.height_m == pytest.approx(own.height_m)
+        assert read.tof_m == pytest.approx(own.tof_m)
+        assert read.battery == pytest.approx(own.battery)

@@ -2,8 +2,11 @@
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.synthetic.flights import wind
+from edgeslam_torch.synthetic.flights.courses import COURSES, flown
+from edgeslam_torch.synthetic.flights.flight import GRAVITY_M_S2
 
 STAMPS_S = np.arange(4000) / 20
 
@@ -42,3 +45,20 @@ def test_lean_and_gust_together_are_the_acceleration(monkeypatch):
     np.testing.assert_allclose(velocity[:, 0], exact[1], atol=5e-3)
     acceleration = np.gradient(velocity[:, 0], stamps)
     np.testing.assert_allclose((lean[:, 0] + 1.0)[2:-1], acceleration[2:-1], atol=0.03)
+
+
+def test_a_drone_leans_against_a_steady_wind():
+    _, _, lean = wind.blown(np.random.default_rng(2), STAMPS_S, 0.5, 0.0)
+    np.testing.assert_allclose(np.linalg.norm(lean, axis=1), 0.5)
+    assert (lean == lean[0]).all()
+
+
+def test_a_windy_course_keeps_clear_and_leans():
+    world, flight, _ = flown(COURSES["windy_blank_corridor"], 0)
+    assert world.clearance(flight.T_w_b[:, :3, 3]).min() > 0.2
+    _, still, _ = flown(COURSES["blank_corridor"], 0)
+    moved = flight.T_w_b[:, :3, 3] - still.T_w_b[:, :3, 3]
+    assert 0.02 < moved[:, :2].std() < 0.3
+    up = flight.T_w_b[:, :3, :3].mean(0)[:2, 2] - still.T_w_b[:, :3, :3].mean(0)[:2, 2]
+    assert 0.5 * 0.5 / GRAVITY_M_S2 < np.linalg.norm(up) < 1.5 * 0.5 / GRAVITY_M_S2, "three degrees, on average"
+    assert np.abs(Rotation.from_matrix(flight.T_w_b[:, :3, :3]).as_euler("ZYX")[:, 1:]).max() < np.deg2rad(15)

@@ -53,3 +53,11 @@ def test_a_pile_of_books_stays_below_the_next_board():
         built = scene()
         build(built, Place(0.0, 0.0, 0.0), np.random.default_rng(seed), "books", headroom=0.05)
         assert all(b.centre_w[2] + b.half_m[2] <= 0.05 for b in built.boxes)
+
+
+def test_values_that_are_given_are_not_drawn():
+    drawn, given = scene(), scene()
+    assert 0.82 <= build(drawn, Place(0.0, 0.0, 0.0), np.random.default_rng(0), "door")["wide"] <= 0.95
+    build(given, Place(0.0, 0.0, 0.0), np.random.default_rng(0), "door", wide=2.0, height=1.0)
+    panel = next(s for s in given.surfaces if s.name == "door")
+    assert (np.linalg.norm(panel.u_w), np.linalg.norm(panel.v_w)) == pytest.approx((2.0, 1.0))

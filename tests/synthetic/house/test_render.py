@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera import PRESETS, Camera
 from edgeslam_torch.synthetic.house.render import depth_map, picture, render
 from edgeslam_torch.synthetic.house.views import look, random_pose
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
@@ -111,3 +111,13 @@ def test_a_picture_and_a_depth_map_are_those_of_a_view_with_plain_borders(furnis
     plain = render(furnished, SMALL, T_w_c, antialias=False)
     np.testing.assert_array_equal(picture(furnished, SMALL, T_w_c), plain.image)
     np.testing.assert_array_equal(depth_map(furnished, SMALL, T_w_c), plain.depth_m)
+
+
+def test_a_distorted_camera_is_refused(furnished):
+    with pytest.raises(ValueError, match="no distortion"):
+        render(furnished, PRESETS["tum_fr1"], look(np.zeros(3), 0.0))
+
+
+def test_world_without_quads_is_refused():
+    with pytest.raises(ValueError, match="1 to 32767 quads"):
+        World([])

@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.synthetic.flights.courses import BUILDING_M
+from edgeslam_torch.synthetic.flights.flight import FlightPlan, fly
+from edgeslam_torch.synthetic.flights.paths import around
 from edgeslam_torch.synthetic.house.render import depth_map
 from edgeslam_torch.synthetic.house.views import look
-from edgeslam_torch.synthetic.sites.build import named_site
+from edgeslam_torch.synthetic.sites.build import JUDGED, named_site, place
 from edgeslam_torch.synthetic.sites.obstacles import PASSAGE_M
 
 CAMERA = Camera(80, 60, 50.0, 50.0, 39.5, 29.5)
@@ -99,3 +102,30 @@ def test_glass_is_hit_and_not_seen():
     y = wide / 2 * (1 if hit[1] else -1)
     seen = depth_map(site.world, CAMERA, look(np.array([5.0, y, 1.5]), 0.0))[30, 40]
     assert seen > 2.0
+
+
+def test_the_drone_starts_at_the_origin_of_its_own_world(flat):
+    assert flat.in_site(np.zeros(3)) == pytest.approx([0.8, 2.0, 0.0])
+    assert flat.in_site(flat.goal_w) == pytest.approx([6.0, 5.2, 1.1])
+    (way_out,) = flat.exits
+    assert flat.in_site(way_out.centre_w) == pytest.approx([5.0, 1.4, 1.025])
+    assert way_out.width_m == 1.1 and way_out.normal_w == pytest.approx([0.0, -1.0, 0.0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", JUDGED)
+def test_seeds_of_a_judged_site_can_be_built(name):
+    for seed in range(6):
+        site = named_site(name, seed)
+        assert site.clearance(site.goal_w[None])[0] > PASSAGE_M - 0.1
+
+
+@pytest.mark.slow
+def test_the_line_through_the_building_is_free_and_leads_into_all_ten_rooms():
+    rng = np.random.default_rng(0)
+    world = place("building", rng)
+    flight = fly(rng, world, 840, around(BUILDING_M), rate_hz=15.0, plan=FlightPlan(speed_m_s=0.8))
+    p = flight.T_w_b[:, :3, 3]
+    assert world.clearance(p).min() > 0.3
+    rooms = {(int(column), bool(row > 0)) for column, row in zip(np.floor(p[:, 0] / 4.0 + 2.5), p[:, 1], strict=True)}
+    assert rooms == {(column, row) for column in range(5) for row in (False, True)}

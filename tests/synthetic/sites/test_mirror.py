@@ -7,6 +7,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.house.views import look
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
+from edgeslam_torch.synthetic.sites.build import named_site
 from edgeslam_torch.synthetic.sites.mirror import REFLECTION, mirrored
 
 CAMERA = Camera(80, 60, 50.0, 50.0, 39.5, 29.5)
@@ -26,3 +27,10 @@ def test_a_mirror_shows_what_is_behind_the_camera_twice_as_far_as_the_mirror():
     assert seen.image[30, [25, 55], 0].tolist() == [50, 200], "left stays left"
     line = np.array([[4.0 - away, 0.0, 1.5] for away in (1.0, 0.5, 0.0)])
     np.testing.assert_allclose(world.distance_to_solid(line), [1.0, 0.5, 0.0], atol=1e-9)
+
+
+def test_a_mirror_is_hit_and_what_it_shows_is_not():
+    site = named_site("mirror", 0)
+    wall = float(site.world.bounds_w[1, 0])
+    line = np.array([[wall - away, 0.0, 1.3] for away in (1.0, 0.5, 0.0)])
+    np.testing.assert_allclose(site.world.distance_to_solid(line), [1.0, 0.5, 0.0], atol=0.02)

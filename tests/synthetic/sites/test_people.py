@@ -58,3 +58,9 @@ def test_a_hovering_drone_is_hit_by_who_walks_into_it(person):
     (contact,) = drone.contacts
     assert contact.speed_m_s == pytest.approx(0.5, abs=0.05), "the walker's speed; the drone hovers"
     assert not contact.crashed
+
+
+def test_a_walker_is_painted_where_they_can_be_hit(person):
+    for at_s in (0.0, 4.3, 9.1):
+        corners = np.concatenate([quad.corners_w for quad in person.painted(at_s)])
+        assert person.distance(corners, at_s).max() < 1e-9

@@ -52,3 +52,12 @@ def test_a_look_up_is_exact_at_steps_of_a_256th():
     ]
     expected = np.rint(((256 - fy) * above + fy * below) / 65536)
     np.testing.assert_array_equal(looked_up(image, x / 256, y / 256), expected)
+
+
+def test_a_product_saturates():
+    assert product(np.array([[200]], np.uint8), np.array([[1.5]], np.float32)).tolist() == [[255]]
+
+
+def test_the_border_goes_on_outside():
+    image = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    assert looked_up(image, np.array([[-9.0, 99.0]]), np.array([[99.0, -1.0]])).tolist() == [[8, 3]]

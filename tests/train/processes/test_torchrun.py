@@ -87,3 +87,9 @@ def test_killed_process_ends_the_other_clearly_and_training_goes_on(run_folder, 
     assert done.returncode == 0, done.stderr
     assert f"resumes after step {step}" in done.stdout
     assert saved_step(out / "last.pt") == 400
+
+
+def test_more_processes_than_images_are_refused(run_folder, weights, tmp_path):
+    done = run(*TORCHRUN, *MODULE, *words(run_folder, weights, tmp_path / "out", 4), "--batch", "1")
+    assert done.returncode == 1
+    assert "2 processes for a batch of 1" in done.stderr

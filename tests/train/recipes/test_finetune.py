@@ -22,6 +22,7 @@ from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import loop
 from edgeslam_torch.train.callbacks import ProgressBar
 from edgeslam_torch.train.state import saved_step
+from edgeslam_torch.writers.own_folder import FolderLock
 
 METADATA = Metadata(
     input_height=32, input_width=64, focal_px=60.0, data=("rooms",), licence="Apache-2.0", metrics={"abs_rel": 0.2}
@@ -271,3 +272,47 @@ def test_hooks_of_the_command_line_take_part(finetune, tmp_path):
     assert saved_step(tmp_path / "out" / loop.LAST) == 1
     record = json.loads((tmp_path / "out" / "finetune.json").read_text())
     assert record["given"]["hooks"] == ["hooks_of_a_user:Stop"]
+
+
+def test_other_weights_are_refused(finetune, trained, tmp_path):
+    network = narrow_fastdepth(METADATA, seed=1)
+    save_checkpoint(network, METADATA, tmp_path / "other.safetensors")
+    refused(finetune("kitchen", "--weights", str(tmp_path / "other.safetensors")), "weights: ")
+    own = tmp_path / "out" / "weights.safetensors"
+    refused(finetune("kitchen", "--weights", str(own), "--overwrite"), "would be overwritten")
+    assert own.is_file()
+
+
+@pytest.mark.slow
+def test_moved_data_and_folder_go_on(finetune, recordings, tmp_path):
+    folder = shutil.copytree(recordings / "kitchen", tmp_path / "here" / "kitchen")
+    finetune(str(folder), out=tmp_path / "first")
+    shutil.move(tmp_path / "here", tmp_path / "there")
+    shutil.move(tmp_path / "first", tmp_path / "second")
+    code, stdout, _ = finetune(str(tmp_path / "there" / "kitchen"), out=tmp_path / "second", steps=10)
+    assert code == 0
+    assert "resumes after step 8" in stdout
+
+
+def test_damaged_record_is_named(finetune, trained, tmp_path):
+    for text in ("", "{}", "[1]", '{"given": {"weights": 1, "data": 5}}', "[" * 100_000):
+        (tmp_path / "out" / "finetune.json").write_text(text)
+        refused(finetune("kitchen"), "finetune.json: unreadable")
+
+
+def test_two_at_the_same_time_are_refused(finetune, tmp_path):
+    (tmp_path / "out").mkdir()
+    lock = FolderLock(tmp_path / "out")
+    refused(finetune("kitchen"), f"process {os.getpid()}")
+    lock.release()
+
+
+@pytest.mark.slow
+def test_depth_too_far_to_validate_on_is_learnt_from_all_the_same(finetune, recordings, tmp_path):
+    far = shutil.copytree(recordings / "kitchen", tmp_path / "far")
+    for path in (far / "depth").iterdir():
+        cv2.imwrite(str(path), np.full((48, 64), 20_000, np.uint16))
+    code, stdout, _ = finetune(str(far))
+    assert code == 0
+    assert "not validated" in stdout
+    refused(finetune("kitchen", "--validate", str(far), out=tmp_path / "other"), "no depth between 0.1 and 10 m")

@@ -14,6 +14,7 @@ from edgeslam_torch.commands.training import finetune as command
 from edgeslam_torch.commands.training._inputs import EXIT_INTERRUPTED
 from edgeslam_torch.errors import OutputError, SourceError
 from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
+from edgeslam_torch.train.recipes.finetune import Data
 from edgeslam_torch.train.teachers import teach as teacher
 from edgeslam_torch.train.views import posed, slam_runs
 from edgeslam_torch.train.views.posed import load_run
@@ -204,3 +205,18 @@ def test_interrupted_and_failed_slam_is_not_taken_for_a_run(run_folder, tmp_path
     ensure_run(recording, out)
     assert slam.calls == 3
     assert posed.is_run_folder(out)
+
+
+def test_run_without_a_useful_pair_is_named_and_gives_no_name(run_folder, tmp_path, caplog):
+    sequence = load_run(run_folder)
+    still = replace(sequence, name="hovering", partners=[()] * len(sequence.views))
+    with pytest.raises(SourceError, match="no run with two images of one place with a baseline"):
+        Data(posed=[still]).usable()
+    with caplog.at_level(logging.WARNING):
+        kept = Data(posed=[still, sequence]).usable()
+    assert [s.name for s in kept.posed] == ["run"]
+    assert "hovering: no two images" in caplog.text
+
+
+def test_first_frames_alone_are_used_when_asked(run_folder):
+    assert len(load_run(run_folder, max_frames=10).views) == 9, "one of the ten is lost"

@@ -66,3 +66,13 @@ def test_flat_views_are_kept_by_lot():
     wall, room = np.full((6, 8), 2.0), np.linspace(1.0, 4.0, 48).reshape(6, 8)
     kept = [rendered_views.is_worth_learning(depth, lot) for depth in (wall, room, 0 * wall) for lot in (0.1, 0.9)]
     assert kept == [True, False, True, True, False, False]
+
+
+@pytest.mark.slow
+def test_files_that_are_there_stay(tmp_path):
+    kept = tmp_path / "places_00000.npz"
+    kept.write_bytes(b"kept")
+    count = rendered_views.PLACES_A_FILE
+    assert rendered_views.render_files(tmp_path, rendered_views.place_views, count, 21) == [kept]
+    assert kept.read_bytes() == b"kept"
+    assert list(tmp_path.iterdir()) == [kept]

@@ -44,7 +44,8 @@ def test_every_source_of_the_default_has_a_share_in_both_phases():
 
 
 def test_only_weights_of_one_network_have_a_mean():
-    first = {"w": torch.zeros(2)}
-    torch.testing.assert_close(mean_of(first, {"w": torch.ones(2)}, 0.25), {"w": torch.full((2,), 0.25)})
+    first = {"w": torch.zeros(2), "count": torch.tensor(3)}
+    mean = mean_of(first, {"w": torch.ones(2), "count": torch.tensor(9)}, 0.25)
+    torch.testing.assert_close(mean, {"w": torch.full((2,), 0.25), "count": torch.tensor(3)})
     with pytest.raises(WeightsError, match="one network"):
         mean_of(first, {"w": torch.ones(3)}, 0.5)

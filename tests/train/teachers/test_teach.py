@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.train.teachers.plane_sweep import sweep_depth
+from edgeslam_torch.train.teachers.plane_sweep import aggregate, sweep_depth
 from edgeslam_torch.train.teachers.teach import densify
 
 K = np.array([[100.0, 0.0, 59.5], [0.0, 100.0, 44.5], [0.0, 0.0, 1.0]])
@@ -86,3 +86,19 @@ def test_one_outlier_changes_little(rng):
     log_z = true[np.rint(uv[:, 1]).astype(int), np.rint(uv[:, 0]).astype(int)].copy()
     log_z[7] += 1.5
     assert np.abs(densify(true, uv, log_z) - true).max() < 0.02
+
+
+def test_bare_pixels_follow_their_neighbours():
+    """Uninformative costs take the plane of their surroundings; informative ones keep their minimum."""
+    cost = np.full((8, 20, 20), 1.0, np.float32)
+    cost[3] = 0.2
+    cost[:, 6:14, 6:14] = 0.7
+    cost[6, 0, 0] = 0.0
+    found = aggregate(cost, np.zeros((20, 20), np.float32)).argmin(2)
+    assert (found[1:] == 3).all()
+
+
+def test_far_from_points_the_median_ratio_is_used():
+    uv = np.stack([np.linspace(5, 20, 40), np.linspace(5, 20, 40)], 1)
+    out = densify(np.zeros((120, 160), np.float32), uv, np.full(40, 0.25))
+    assert out[110, 150] == pytest.approx(0.25, abs=1e-3)

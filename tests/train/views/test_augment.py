@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.train.views.augment import AugmentConfig, View, fitted_view, random_view, scaled_K, warp
+from edgeslam_torch.train.views.augment import AugmentConfig, View, fitted_view, mirrored, random_view, scaled_K, warp
 
 PLAIN = AugmentConfig(brightness=0, contrast=0, saturation=0, channel=0, gamma=(1, 1), grey=0, blur=0, noise=0)
 
@@ -65,3 +65,25 @@ def test_random_views_keep_the_plane_flat_and_follow_the_seed():
     a, b = (random_view(view, (64, 96), AugmentConfig(), np.random.default_rng(9)) for _ in range(2))
     np.testing.assert_array_equal(a.image, b.image)
     np.testing.assert_array_equal(a.depth_m, b.depth_m)
+
+
+def test_mirror_twice_is_the_same():
+    view = plane_view()
+    once = mirrored(view)
+    assert once.K[0, 2] == pytest.approx(159 - view.K[0, 2])
+    flipped = points(once)[:, ::-1] * (-1, 1, 1)
+    np.testing.assert_allclose(flipped, points(view), atol=1e-5)
+    np.testing.assert_array_equal(mirrored(once).image, view.image)
+
+
+def test_holes_stay_holes():
+    view = plane_view()
+    view.depth_m[:, :80] = 0
+    new = warp(view, view.K, np.eye(3), (120, 160))
+    np.testing.assert_array_equal(new.depth_m == 0, view.depth_m == 0)
+
+
+def test_a_smaller_view_mixes_no_depths(rng):
+    depth = rng.choice([0.0, 1.0, 5.0], (40, 60)).astype(np.float32)
+    small = fitted_view(View(np.zeros((40, 60, 3), np.uint8), depth, np.eye(3)), (16, 24))
+    assert set(np.unique(small.depth_m)) <= {0.0, 1.0, 5.0}

@@ -124,3 +124,26 @@ def test_absurd_depth_scale_is_refused(tmp_path, scale):
 def test_unit_of_depth_in_the_words_of_orb_slam(tmp_path, key):
     depth = load_depth_folder(scaled(tmp_path, f"{key}: 1000.0")).views[0].depth_m
     np.testing.assert_allclose(depth[20], np.linspace(1, 3, 64), atol=1e-3)
+
+
+def test_reduced_image_has_reduced_intrinsics(tmp_path):
+    view = load_depth_folder(write_folder(tmp_path / "a", 1), width=32).views[0]
+    assert view.image.shape == (24, 32, 3)
+    np.testing.assert_allclose(view.K, CAMERA.scaled(32, 24).K)
+
+
+def test_folder_of_nothing_but_holes_is_refused(tmp_path):
+    folder = write_folder(tmp_path / "a", 3)
+    for path in (folder / "depth").iterdir():
+        cv2.imwrite(str(path), np.zeros((48, 64), np.uint16))
+    with pytest.raises(SourceError, match="no image with depth could be read .*no depth between"):
+        load_depth_folder(folder)
+
+
+@pytest.mark.parametrize("stamp", ["nan", "inf", "later"])
+def test_stamp_that_is_no_number_is_left_out(tmp_path, stamp):
+    folder = write_folder(tmp_path / "a", 3)
+    with (folder / "rgb.txt").open("a") as file:
+        file.write(f"{stamp} rgb/0.png\n")
+    loaded = load_depth_folder(folder)
+    assert len(loaded.views) == 3 and "rgb.txt:5" in loaded.left_out[0]

@@ -40,3 +40,8 @@ def test_draws_follow_the_generator_and_reach_all_edges():
 def test_grey_levels_are_refused_with_what_to_do(images):
     with pytest.raises(ValueError, match="divide grey levels by 255"):
         edge_pixels(images, 4)
+
+
+def test_image_without_a_batch_is_refused():
+    with pytest.raises(ValueError, match=r"\(3, 40, 48\)"):
+        edge_pixels(squares()[0], 5)

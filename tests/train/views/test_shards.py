@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.train import folder
 from edgeslam_torch.train.recipes.finetune import HELD_OUT, MOST_HELD_OUT, _split
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import DepthFolder
@@ -125,3 +126,12 @@ def test_views_are_divided_without_reading_those_to_learn_from(count):
     number = [int(v.depth_m[0, 0]) for v in held_out]
     rest = [int(source.views[i].depth_m[0, 0]) for i in range(len(source.views))]
     assert sorted(number + rest) == list(range(count))
+
+
+def test_record_changes_with_the_content_and_reads_no_sample(tmp_path):
+    write_shards(views(3), tmp_path, "flight")
+    first = folder.content(load_shards(tmp_path))
+    assert first.startswith("3, ")
+    assert folder.content(load_shards(tmp_path)) == first
+    write_shards(views(4)[1:], tmp_path, "flight")
+    assert folder.content(load_shards(tmp_path)) != first
