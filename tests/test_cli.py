@@ -5,10 +5,12 @@ import json
 import os
 import pty
 import shlex
+import signal
 import subprocess
 import sys
 import time
 
+import cv2
 import numpy as np
 import pytest
 from fake_slam import FakeSlam
@@ -266,3 +268,101 @@ def test_a_pipe_in_a_folder_of_somebody_else_is_not_waited_for(edgeslam, recordi
         assert (code == 0) or "error:" in err
         path.unlink(missing_ok=True)
         path.write_bytes(content)
+
+
+def test_what_was_never_tracked_was_not_never_lost(edgeslam, recording, tmp_path):
+    for image in (recording / "rgb").iterdir():
+        cv2.imwrite(str(image), np.zeros((48, 64), np.uint8))
+    code, out, _ = edgeslam("run", recording, "--out", tmp_path / "out", "--no-report")
+    assert code == 1, "nothing tracked is no success"
+    assert "0 of 6 frames tracked (0.0 %), " in out
+    assert "lost" not in out
+
+
+def test_a_part_of_a_recording_is_run(edgeslam, recording, tmp_path):
+    def stamps(name, *words):
+        assert edgeslam("run", recording, "-o", tmp_path / name, *words)[0] == 0
+        rows = (tmp_path / name / "status.csv").read_text().splitlines()
+        return [row.split(",")[rows[0].split(",").index("stamp_s")] for row in rows[1:]]
+
+    whole = stamps("whole")
+    assert stamps("part", "--start", "1", "--stride", "2", "--max-frames", "2") == whole[1:4:2]
+    code, _, err = edgeslam("run", recording, "-o", tmp_path / "none", "--start", "5000")
+    assert code == 1 and "5000" in err
+    assert edgeslam("run", "webcam:0", "--stride", "2")[0] == 1
+
+
+def test_verbose_shows_the_traceback(edgeslam, tmp_path):
+    from edgeslam_torch.errors import SourceError
+
+    with pytest.raises(SourceError):
+        edgeslam("run", tmp_path / "nowhere", "-v")
+
+
+def test_no_command_shows_help(edgeslam):
+    code, out, _ = edgeslam()
+    assert code == 2
+    assert "commands:" in out
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_completion_lists_commands_and_options(shell, edgeslam):
+    code, out, _ = edgeslam("--print-completion", shell)
+    assert code == 0 and "export-map" in out and "--save-atlas" in out
+
+
+def test_commands_without_a_module_are_not_offered(edgeslam, monkeypatch):
+    monkeypatch.setitem(cli.COMMANDS, "fly", ("edgeslam_torch.commands.fly_away", "leave"))
+    assert "fly" not in cli.available()
+    assert edgeslam("fly")[0] == 2
+
+
+CTRL_C_AT_IMPORT = """
+import os, signal, sys
+
+class CtrlC:
+    def find_spec(name, path=None, target=None):
+        if name == at:
+            os.kill(os.getpid(), signal.SIGINT)
+
+at = sys.argv.pop()
+sys.meta_path.insert(0, CtrlC)
+from edgeslam_torch.cli import main
+sys.exit(main())
+"""
+
+
+def test_ctrl_c_while_modules_load_ends_with_one_line(recording, tmp_path):
+    """numpy makes an ImportError of what comes while it looks for datetime."""
+    words = ["run", str(recording), "--out", str(tmp_path / "out"), "datetime"]
+    done = subprocess.run([sys.executable, "-c", CTRL_C_AT_IMPORT, *words], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (130, "edgeslam: interrupted")
+    assert "Traceback" not in done.stderr
+
+
+def test_program_ends_without_a_word_when_interrupted_at_its_end():
+    code = "import os, signal, sys; from edgeslam_torch.cli import main; main(); os.kill(os.getpid(), signal.SIGINT)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+
+
+def test_runs_without_out_are_numbered_and_none_is_replaced(edgeslam, recording, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("seq", "seq-2", "seq-3"):
+        assert edgeslam("run", recording, "--no-report")[0] == 0
+        assert (tmp_path / "runs" / name / "trajectory.txt").is_file()
+
+
+def test_a_recording_is_no_run_to_view_or_report(edgeslam, recording):
+    (recording / "groundtruth.txt").write_text("100.0 0 0 0 0 0 0 1\n100.1 0 0 0 0 0 0 1\n")
+    before = sorted(recording.iterdir())
+    for command in (("view", "--print"), ("report",)):
+        code, _, err = edgeslam(command[0], recording, *command[1:])
+        assert code == 1 and "no run wrote" in err
+    assert sorted(recording.iterdir()) == before
+
+
+@pytest.mark.parametrize("source", ["a" * 5000, "webcam:99999999999", "webcam:\u0663", "b/" * 3000])
+def test_impossible_sources_are_one_short_line(edgeslam, source):
+    code, _, err = edgeslam("run", source)
+    assert code == 1 and len(err.splitlines()) == 1 and len(err) < 3000

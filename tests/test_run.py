@@ -1,5 +1,6 @@
 """The run loop around a SLAM system that knows the answer."""
 
+import csv
 import json
 import os
 import signal
@@ -19,9 +20,10 @@ from edgeslam_torch.eval.inputs.run_folder import open_run
 from edgeslam_torch.files.config_file import load_config
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
+from edgeslam_torch.readers.pace import Counter, at_their_pace
 from edgeslam_torch.readers.source import open_source
-from edgeslam_torch.run import AtlasFiles, run
-from edgeslam_torch.types import TelemetrySample
+from edgeslam_torch.run import AtlasFiles, Mode, run
+from edgeslam_torch.types import Frame, TelemetrySample
 from edgeslam_torch.writers import run_summary
 from edgeslam_torch.writers.ply import read_ply
 
@@ -234,3 +236,103 @@ def test_memory_is_the_runs_own_and_not_that_of_the_process_that_started_it():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     here = run_summary.peak_rss_mb()
     assert float(done.stdout) < here - 0.9 * large.nbytes / 2**20
+
+
+def test_telemetry_of_another_time_is_a_warning_of_the_run(tmp_path, write_tum):
+    """Frames from 100 s on: what is stamped later never reaches the system, which cannot know that it is there."""
+    source, slam = open_source(write_tum(tmp_path / "seq", 4)), FakeSlam()
+    source.telemetry = [TelemetrySample(500.0 + 0.1 * k) for k in range(50)]
+    summary = run(source, tmp_path / "out", make_slam=fake(slam)).summary
+    assert any("stamped after the frames" in w for w in summary["warnings"])
+
+
+def test_status_names_each_frames_image(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "seq", 3)
+    result = run(open_source(folder), tmp_path / "out", make_slam=fake(FakeSlam()))
+    with (result.folder / "status.csv").open() as file:
+        named = [row["image"] for row in csv.DictReader(file)]
+    assert named == sorted(str(path.relative_to(folder)) for path in (folder / "rgb").iterdir())
+
+
+def test_a_list_that_runs_backwards_costs_no_coverage(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "seq", 10)
+    lines = (folder / "rgb.txt").read_text().splitlines()
+    (folder / "rgb.txt").write_text("\n".join(lines[::-1]))
+    summary = run(open_source(folder), tmp_path / "out", make_slam=fake(FakeSlam())).summary
+    assert (summary["frames"], summary["left_out"], summary["coverage"]) == (10, 0, 1.0)
+    assert "from the last to the first" in summary["problems"][0]["reason"]
+
+
+def test_nohup_goes_on_when_the_terminal_closes(tmp_path, write_tum):
+    def hang_up(step):
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        result = run(
+            open_source(write_tum(tmp_path / "seq", 3)), tmp_path / "out", make_slam=fake(FakeSlam(on_step=hang_up))
+        )
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert not result.interrupted and result.summary["frames"] == 3
+
+
+def test_ctrl_c_while_results_are_written_loses_none(tmp_path, write_tum):
+    class Watched(FakeSlam):
+        def trajectory(self):
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+            return super().trajectory()
+
+    result = run(open_source(write_tum(tmp_path / "seq", 3)), tmp_path / "out", make_slam=fake(Watched()))
+    assert {p.name for p in result.folder.iterdir()} == FILES
+
+
+def test_results_are_read_once_nothing_maps_beside_any_more(tmp_path, write_tum):
+    asked = []
+
+    class Watched(FakeSlam):
+        def close(self):
+            asked.append("close")
+
+        def trajectory(self):
+            asked.append("trajectory")
+            return super().trajectory()
+
+        def edge_map(self):
+            asked.append("edge_map")
+            return super().edge_map()
+
+    run(open_source(write_tum(tmp_path / "seq", 3)), tmp_path / "out", make_slam=fake(Watched()))
+    assert asked[0] == "close"
+    assert {"trajectory", "edge_map"} <= set(asked)
+
+
+def frames_at(stamps):
+    image = np.zeros((4, 4), np.uint8)
+    return iter([Frame(i, stamp, image) for i, stamp in enumerate(stamps)])
+
+
+def test_realtime_keeps_pace_and_drops_the_oldest_waiting():
+    dropped = Counter()
+    frames = at_their_pace(frames_at(0.002 * i for i in range(50)), dropped, waiting=2)
+    first = next(frames)
+    until = time.monotonic() + 0.05
+    while time.monotonic() < until:
+        pass  # a slow step
+    rest = list(frames)
+    order = [frame.index for frame in (first, *rest)]
+    assert order == sorted(order)
+    assert 1 + len(rest) + dropped.value == 50
+    assert dropped.value > 5
+    assert rest[-1].index == 49
+
+
+def test_realtime_drops_nothing_when_there_is_time(tmp_path, write_tum):
+    result = run(
+        open_source(write_tum(tmp_path / "seq", 3)), tmp_path / "out", mode=Mode.REALTIME, make_slam=fake(FakeSlam())
+    )
+    assert result.summary["dropped_frames"] == 0
+    assert result.summary["frames"] == 3
+    assert result.summary["duration_s"] > 0.19

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.calibration.board import Board, calibrate
+from edgeslam_torch.calibration.board import Board, board_size, calibrate
 from edgeslam_torch.cli import main
 from edgeslam_torch.errors import CalibrationError
 from edgeslam_torch.geometry.camera import Camera
@@ -151,3 +151,46 @@ def test_a_real_tello_is_calibrated_as_ros_did(data_dir):
     assert result.camera.cy == pytest.approx(theirs.cy, abs=8.0)
     assert result.rms_px <= 0.4
     assert result.coverage > 0.8
+
+
+def test_size_of_the_board_is_found_by_trying(rng):
+    pictures = [image for _, image in views(rng, chessboard(7, 5), 3)]
+    assert board_size(pictures) == (7, 5)
+
+
+def test_the_file_says_how_well_the_focal_length_is_known(rng):
+    result = calibrate(views(rng, chessboard(), 12), Board(8, 6))
+    off = abs(result.camera.fx / CAMERA.fx - 1.0)
+    assert 1e-4 < result.camera.focal_sigma < 0.02
+    assert off < 4.0 * result.camera.focal_sigma
+
+
+def test_a_picture_that_moved_is_left_out(rng):
+    good = list(views(rng, chessboard(), 12))
+    shear = np.array([[1.0, 0.06, 0.0], [0.0, 1.0, 0.0]])  # what a rolling shutter makes of a quick turn
+    moved = cv2.warpAffine(good[3][1], shear, (640, 480), borderValue=150)
+    pictures = [*good[:3], ("moved.png", moved), *good[4:]]
+    result = calibrate(pictures, Board(8, 6))
+    assert "its corners miss" in result.rejected["moved.png"]
+    assert result.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
+
+
+def test_no_board_at_all_is_an_error_that_says_what_to_do(rng):
+    with pytest.raises(CalibrationError, match="--board"):
+        calibrate([("noise.png", rng.integers(0, 255, (120, 160), dtype=np.uint8))], Board(8, 6))
+    with pytest.raises(CalibrationError, match="0 usable"):
+        calibrate([], Board())
+
+
+@pytest.mark.parametrize("wrong", [{"columns": 2, "rows": 6}, {"square_m": 0.0}, {"charuco": True}])
+def test_impossible_boards_are_refused(wrong):
+    with pytest.raises(CalibrationError):
+        Board(**wrong)
+
+
+def test_pictures_that_cannot_be_read_are_named_when_too_few_are_left(tmp_path, capsys):
+    (tmp_path / "bomb.pgm").write_bytes(b"P5 17000 17000 255\n")
+    assert main(["calibrate", str(tmp_path), "--board", "8x6", "--out", str(tmp_path / "c.yaml")]) == 1
+    said = capsys.readouterr().err
+    assert "1 could not be read (the first: " in said
+    assert "bomb.pgm: image is 17000x17000" in said

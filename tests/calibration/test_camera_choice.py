@@ -57,3 +57,8 @@ def test_a_tello_at_low_resolution_has_its_own_lens():
     assert camera.cy == pytest.approx(239.0, abs=2.0)
     assert any("Tello" in note for note in notes)
     assert choose_camera((960, 720), is_drone=True)[0].K.tolist() == [[925, 0, 485], [0, 925, 360], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(("cx", "cy"), [(318.6, 255.3), (355.0, 270.0), (290.0, 210.0)])
+def test_usual_principal_points_pass_without_a_word(cx, cy):
+    assert _doubts(cx=cx, cy=cy) == []

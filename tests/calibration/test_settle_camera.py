@@ -48,3 +48,11 @@ def test_too_few_images_keep_the_guess_and_its_warning(recording):
     assert source.camera.fx == 384.0
     assert "image pairs usable" in source.camera.source
     assert any("guessing a focal length of 384 px" in w for w in source.warnings)
+
+
+def test_live_source_is_not_touched(recording):
+    source = open_source(recording)
+    source.live = True
+    before = source.camera
+    settle_camera(source)
+    assert source.camera is before

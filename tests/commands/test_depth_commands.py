@@ -4,6 +4,7 @@ import argparse
 import importlib
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,13 +13,15 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from small_networks import RELATIVE, describe, green_network
 
 from edgeslam_torch.errors import ConfigError, EdgeSlamError
 from edgeslam_torch.frontend.depth_network import DepthPredictor
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
-from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
+from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Variant, Widths
+from edgeslam_torch.models.onnx.graph import build_graph
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.types import DepthMap
 
@@ -168,3 +171,65 @@ def test_download_says_how_far_a_file_can_be_trusted(tmp_path, capsys, monkeypat
 
 
 # -- networks of others --------------------------------------------------------------------------------------------
+
+
+def test_depth_names_the_images_that_it_left_out(weights, pictures, tmp_path, capsys):
+    (pictures / "img1.png").write_bytes(b"\x89PNG")
+    assert run("depth", pictures, "--out", tmp_path / "out", "--weights", weights, "--max-frames", "3") == 0
+    said = capsys.readouterr().out
+    assert "left out: " in said
+    assert "img1.png: " in said
+
+
+def test_two_images_of_one_name_are_two_depth_maps(weights, pictures, tmp_path):
+    for old in pictures.glob("*.png"):
+        if old.name != "img0.png":
+            old.unlink()
+    cv2.imwrite(str(pictures / "img0.jpg"), cv2.imread(str(pictures / "img0.png"))[::-1])
+    run("depth", pictures, "--out", tmp_path / "out", "--weights", weights)
+    maps = sorted((tmp_path / "out").glob("*.npy"))
+    assert len(maps) == 2
+    assert not np.array_equal(np.load(maps[0]), np.load(maps[1]))
+
+
+def test_a_download_that_is_no_network_is_not_remembered(tmp_path, monkeypatch):
+    from edgeslam_torch.models import download as module
+
+    monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path))
+    monkeypatch.setattr(module, "fetch", lambda url, part, *_: part.write_bytes(b"<html>not found</html>"))
+    with pytest.raises(EdgeSlamError, match="checkpoint"):
+        run("weights", "download", "mobilenet-nnconv5")
+    assert not list(tmp_path.glob("*.sha256"))
+
+
+def test_inspect_reads_exported_files_and_shows_no_control_characters(weights, tmp_path, capsys):
+    network, metadata = load_checkpoint(weights)
+    loud = replace(metadata, notes="red \x1b[31m\nlicence: free", input_height=2048, input_width=2048, focal_px=1000.0)
+    save_checkpoint(network, loud, tmp_path / "loud.safetensors")
+    run("weights", "inspect", tmp_path / "loud.safetensors")
+    assert "notes: red \\x1b[31m\\nlicence: free" in capsys.readouterr().out
+    (tmp_path / "w.onnx").write_bytes(build_graph(weights)[0])
+    run("weights", "inspect", tmp_path / "w.onnx")
+    assert "focal_px: 105.0" in capsys.readouterr().out
+
+
+def test_depth_maps_of_a_relative_network_would_have_no_unit(pictures, tmp_path):
+    network = describe(green_network(tmp_path / "n.onnx", **RELATIVE), 'preset = "midas-small"\n')
+    with pytest.raises(ConfigError, match="up to scale and shift"):
+        run("depth", pictures, "--out", tmp_path / "out", "--weights", network)
+
+
+def test_network_of_others_is_inspected_by_its_description(tmp_path, capsys):
+    network = describe(green_network(tmp_path / "n.onnx"), 'preset = "metric3d-v2-small"\ndepth = ""\n')
+    assert run("weights", "inspect", network) == 0
+    said = capsys.readouterr().out
+    assert "gives: metres" in said and "focal_px: 1000.0" in said
+
+
+def test_a_missing_device_is_said_before_anything_is_written(weights, pictures, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    out = tmp_path / "out"
+    for words in (("depth", pictures, "--weights", weights), ("run", pictures, "--depth", weights)):
+        with pytest.raises(ConfigError, match="--device cuda: .*; use --device cpu"):
+            run(words[0], *words[1:], "--out", out, "--device", "cuda")
+        assert not out.exists() or not list(out.glob("*.npy")) + list(out.glob("trajectory.txt"))

@@ -38,3 +38,9 @@ def test_table_is_printed_written_and_compared(data, tmp_path, capsys):
 def test_mistakes_are_one_line(data, tmp_path, capsys, arguments):
     assert cli.main(["judge", str(data), "--out", str(tmp_path / "out"), *arguments.split()]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_without_recordings_it_says_so(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("EDGESLAM_DATA", raising=False)
+    assert cli.main(["judge", "--out", str(tmp_path)]) == 1
+    assert "no recordings: DATA or EDGESLAM_DATA" in capsys.readouterr().err

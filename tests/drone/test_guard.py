@@ -117,3 +117,11 @@ def test_only_the_drone_itself_ends_the_asking_for_a_landing(quick, sender, aske
     commands = Loud(sender)
     tello_guard.land(commands, ("192.168.10.1", 8889))
     assert commands.sent.count(LAND) == commands.sent.count(CENTRED) == asked
+
+
+def test_centred_sticks_are_left_alone_while_the_program_hangs(quick):
+    guard = Watched()
+    guard.tell(b"p.")
+    assert [guard.hear(), guard.hear()] == [CENTRED, LAND]  # the landing's own
+    os.close(guard.pipe)
+    assert guard.is_done()

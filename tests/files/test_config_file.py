@@ -5,7 +5,7 @@ from typing import Literal
 
 import pytest
 
-from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.config import EdgeConfig, SlamConfig
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.config_file import keys_of, load_config, to_toml
 
@@ -94,3 +94,16 @@ def test_no_number_may_be_infinite_or_none(key):
     for value in ("nan", "inf", "-inf", "1e999"):
         with pytest.raises(ConfigError, match=key.split(".")[-1]):
             load_config(SlamConfig(), None, [f"{key}=[{value}, 1.0]" if key.endswith("range_s") else f"{key}={value}"])
+
+
+@pytest.mark.parametrize("option", ["orb.levels=21", "orb.features=2000000000"])
+def test_what_costs_gigabytes_or_hours_is_refused(option):
+    with pytest.raises(ConfigError, match="must be at most"):
+        load_config(SlamConfig(), None, [option])
+
+
+def test_numbers_are_checked_in_code_too():
+    with pytest.raises(ValueError, match="edges.canny_high must be finite, got inf"):
+        SlamConfig(edges=EdgeConfig(canny_high=math.inf))
+    with pytest.raises(ValueError, match="edges.max_pixels must be within 32 bits"):
+        SlamConfig(edges=EdgeConfig(max_pixels=2**31))

@@ -9,7 +9,7 @@ import pytest
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.errors import OutputError
-from edgeslam_torch.files.output_file import add_overwrite, check_outputs, output_file
+from edgeslam_torch.files.output_file import add_overwrite, check_new, check_outputs, output_file
 from edgeslam_torch.writers.run_writer import OUTPUTS
 
 
@@ -104,3 +104,8 @@ def test_commands_leave_what_is_there(command, tmp_path, capsys):
     assert [p.name for p in tmp_path.iterdir()] == ["truth.txt"]
     last = capsys.readouterr().err.strip().splitlines()[-1]
     assert last.startswith("edgeslam: error: ") and str(path) in last
+
+
+def test_a_folder_is_no_file(tmp_path):
+    with pytest.raises(OutputError, match="folder"):
+        check_new(tmp_path, overwrite=True)

@@ -91,3 +91,17 @@ def test_a_lock_of_a_killed_run_is_taken(tmp_path, text):
     assert (tmp_path / ".lock").read_text().startswith(f"process {os.getpid()} ")
     lock.release()
     assert not (tmp_path / ".lock").exists()
+
+
+@pytest.mark.parametrize("name", REPLACING)
+def test_a_link_to_nothing_makes_nothing_there(tmp_path, name):
+    (tmp_path / "a.png").symlink_to(tmp_path / "nothing.png")
+    REPLACING[name](tmp_path / "a.png")
+    assert not (tmp_path / "nothing.png").exists()
+
+
+def test_a_lock_of_another_program_stays(tmp_path):
+    (tmp_path / ".lock").write_text("of another program")
+    with pytest.raises(OutputError, match="--out"):
+        FolderLock(tmp_path)
+    assert (tmp_path / ".lock").read_text() == "of another program"

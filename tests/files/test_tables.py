@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files import tables
-from edgeslam_torch.files.tables import read_table
+from edgeslam_torch.files.tables import number, read_table
 from edgeslam_torch.files.time_units import UNKNOWN, seconds_of
 
 ROWS = [[1305031102.175, 1.5, -2.0], [1305031102.21, 0.25, 3.0]]
@@ -98,3 +98,18 @@ def test_units_at_their_limits():
 def test_the_separator_is_that_of_the_header(tmp_path):
     path = written(tmp_path, "recording,settings\na.mp4,x=1;y=2\nb.mp4,x=1;y=2\n")
     assert [row.cells for row in read_table(path, SourceError).rows] == [["a.mp4", "x=1;y=2"], ["b.mp4", "x=1;y=2"]]
+
+
+def test_quoted_numbers_with_decimal_commas_between_commas(tmp_path):
+    path = written(tmp_path, '"t","x"\n"1,5","2,25"\n"2,5","3"\n')
+    assert read_table(path, SourceError).numbers().tolist() == [[1.5, 2.25], [2.5, 3.0]]
+
+
+def test_a_separator_at_the_end_of_each_row_adds_no_column(tmp_path):
+    assert read_table(written(tmp_path, "a,b\n1,2,\n3,4,\n"), SourceError).numbers().shape == (2, 2)
+    assert read_table(written(tmp_path, "a,b,c\n1,2,\n3,4,\n"), SourceError).rows[0].cells == ["1", "2", ""]
+
+
+@pytest.mark.parametrize("text", ["", "1_000", "12cm", "1.000,5", "1,2,3", ",", "x"])
+def test_what_is_no_number(text):
+    assert number(text) is None

@@ -46,3 +46,7 @@ def test_each_keypoint_is_evaluated_at_its_position():
     grey = wedge(90.0)
     uv = np.array([[50.0, 31.5], [31.5, 31.5], [5.0, 5.0], [31.5, 55.0], [0.0, 63.0]])
     assert are_corners(grey, uv, np.ones(5)).tolist() == [False, True, False, False, False]
+
+
+def test_no_keypoints():
+    assert are_corners(wedge(90.0), np.zeros((0, 2)), np.zeros(0)).shape == (0,)

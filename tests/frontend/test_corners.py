@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.frontend.corners import detect_junctions
+from edgeslam_torch.frontend.corners import JunctionConfig, detect_junctions
 
 
 def polygon(rng, centre, radius, sides):
@@ -109,3 +109,18 @@ def test_round_and_straight_contours_are_no_corners():
     cv2.ellipse(image, (450, 240), (120, 60), 30, 0, 360, 200, -1, cv2.LINE_AA)
     image[:, 600:] = 200
     assert len(detect(image)) == 0
+
+
+@pytest.mark.parametrize("image", [np.zeros((480, 640), np.uint8), np.full((64, 64), 255, np.uint8)])
+def test_an_image_without_edges_has_none(image):
+    found = detect(image)
+    assert len(found) == 0
+    assert found.arms.shape == (0, 2, 2)
+    assert found.arm_points(4)[0].shape == (0, 2, 4, 2)
+
+
+def test_most_keeps_the_longest_arms(rng):
+    image, _ = frame(rng)
+    everything, few = detect(image), detect(image, JunctionConfig(most=5))
+    assert len(few) == 5
+    np.testing.assert_array_equal(few.uv, everything.uv[:5])

@@ -77,3 +77,23 @@ def test_inverted_depth_is_rejected_with_one_warning(relative, caplog):
     right = CheckedDepth(Described(0.7, relative))
     assert right(IMAGE, CAMERA) is right.depth.map
     assert right.warning() is None
+
+
+@pytest.mark.parametrize("metres", [0.05, 0.3, 10.0, 100.0, 200.0])
+def test_a_plausible_map_passes_untouched(metres):
+    depth = depth_map(metres)
+    checked = CheckedDepth(lambda image, camera: depth)
+    assert checked(IMAGE, CAMERA) is depth
+    assert checked.warning() is None
+
+
+def test_a_map_of_mostly_bad_pixels_is_rejected():
+    depth = depth_map(2.0)
+    depth.depth_m[:121] = np.nan
+    assert CheckedDepth(lambda image, camera: depth)(IMAGE, CAMERA) is None
+
+
+def test_a_function_without_depth_is_no_failure():
+    checked = CheckedDepth(lambda image, camera: None)
+    assert checked(IMAGE, CAMERA) is None
+    assert checked.warning() is None

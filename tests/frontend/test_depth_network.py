@@ -124,3 +124,55 @@ def test_weights_without_depth_are_rejected_on_loading(tmp_path, backend):
     ):
         with pytest.raises(WeightsError, match=r"w\.safetensors"):
             DepthPredictor(path, backend)
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
+def test_depth_has_the_images_size_and_is_positive(weights, image, backend):
+    predictor = DepthPredictor(weights, backend)
+    depth = predictor(image, CAMERA)
+    assert predictor.backend == backend
+    for field in (depth.depth_m, depth.sigma_log):
+        assert field.shape == (120, 160)
+        assert field.dtype == np.float32
+        assert (field > 0).all()
+
+
+def test_depth_follows_the_focal_length(weights, image):
+    """The same pixels through a lens 1.2 times as long are 1.2 times as far away."""
+    predictor = DepthPredictor(weights)
+    long = predictor(image, replace(CAMERA, fx=1.2 * CAMERA.fx, fy=1.2 * CAMERA.fy))
+    np.testing.assert_allclose(long.depth_m, 1.2 * predictor(image, CAMERA).depth_m, rtol=1e-5)
+
+
+def test_resolution_does_not_change_the_metres(weights, image):
+    large = cv2.resize(image, (480, 360), interpolation=cv2.INTER_NEAREST)
+    predictor = DepthPredictor(weights)
+    a = predictor(image, CAMERA).depth_m.mean()
+    assert predictor(large, CAMERA.scaled(480, 360)).depth_m.mean() == pytest.approx(a, rel=0.05)
+
+
+def test_a_shrunk_image_is_not_rounded_to_grey_levels():
+    """Processors round a mean between two levels differently, and hence would see other depths."""
+    image = np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8)
+    mean = image.reshape(32, 2, 48, 2, 3).mean(axis=(1, 3))
+    assert np.mean(mean % 1.0 == 0.5) > 0.1
+    x = preprocess(image, 32, 48, Metadata())
+    np.testing.assert_allclose(x[0], np.moveaxis(mean[:, :, ::-1], 2, 0) / 127.5 - 1.0, atol=1e-6)
+
+
+def test_wrong_size_backend_and_files_are_rejected(weights, image, tmp_path):
+    with pytest.raises(ValueError, match="does not fit"):
+        DepthPredictor(weights)(image[:60], CAMERA)
+    with pytest.raises(ValueError, match="backend"):
+        DepthPredictor(weights, "tensorflow")
+    with pytest.raises(WeightsError, match="no such weights"):
+        DepthPredictor(tmp_path / "none.safetensors")
+    (tmp_path / "bad.onnx").write_bytes(b"not an onnx file")
+    with pytest.raises(WeightsError, match=r"bad\.onnx"):
+        DepthPredictor(tmp_path / "bad.onnx")
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
+def test_weights_with_constant_output_are_rejected_on_loading(tmp_path, backend):
+    with pytest.raises(WeightsError, match="the same depth for different images"):
+        DepthPredictor(changed(tmp_path, decode_conv6__0__weight=0.0, decode_conv6__1__bias=1.0), backend)

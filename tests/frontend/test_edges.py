@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from rendered import views
 
-from edgeslam_torch.frontend.canny import edge_thresholds
+from edgeslam_torch.frontend.canny import edge_thresholds, noise
 from edgeslam_torch.frontend.edges import extract_edges
 
 
@@ -70,3 +70,16 @@ def test_thresholds_of_well_exposed_pictures_are_as_given():
     low, high = edge_thresholds(in_the_dark(grey, 0.25, 0.0), 40.0, 100.0)
     assert high == pytest.approx(100.0 * 0.25 * np.percentile(grey, 95) / 128.0, rel=0.1)
     assert low == pytest.approx(0.4 * high)
+
+
+def test_normals_are_unit_and_nothing_lies_at_the_border():
+    edges = extract_edges(views()[0], 40.0, 100.0, 100_000, border_px=6)
+    np.testing.assert_allclose(np.linalg.norm(edges.normal, axis=1), 1.0, atol=1e-5)
+    assert edges.uv.min() >= 6
+    assert (edges.uv < [320 - 6, 240 - 6]).all()
+
+
+@pytest.mark.parametrize("sigma", [1.0, 3.0])
+def test_noise_is_that_of_a_shaded_wall(sigma):
+    shaded = np.tile(np.linspace(60.0, 120.0, 640), (480, 1))
+    assert noise(in_the_dark(shaded, 1.0, sigma)) == pytest.approx(np.hypot(sigma, 1 / np.sqrt(12)), rel=0.05)

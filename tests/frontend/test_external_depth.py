@@ -11,8 +11,9 @@ from small_networks import FAR_M, NEAR_M, RELATIVE, describe, green_network, nod
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.frontend import depth_network
+from edgeslam_torch.frontend.depth_check import CheckedDepth
 from edgeslam_torch.frontend.depth_network import open_depth, weights_path
-from edgeslam_torch.frontend.external_depth import ExternalDepth
+from edgeslam_torch.frontend.external_depth import ExternalDepth, relative_depth
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
 from edgeslam_torch.models.record import weights_file
@@ -203,3 +204,82 @@ def test_only_external_data_beside_the_file_is_read(tmp_path, image):
     path.write_bytes(model.SerializeToString())
     with pytest.raises(WeightsError, match="save the network as one file"):
         open_depth(path)
+
+
+def test_a_network_for_any_camera_is_not_rescaled(tmp_path, image):
+    network = open_depth(describe(green_network(tmp_path / "net.onnx"), f'gives = "metres"\nsigma_log = 0.1\n{SIZE}'))
+    found = network(image, CAMERA)
+    np.testing.assert_allclose(found.depth_m[:, :80], NEAR_M, rtol=1e-5)
+    np.testing.assert_allclose(found.sigma_log, 0.1)
+
+
+def test_sigma_is_the_networks_own_where_it_states_one(tmp_path, image):
+    nodes = [node("Mul", "depth tenth", "sigma")]
+    path = green_network(tmp_path / "net.onnx", nodes, "depth sigma", constants={"tenth": 0.1})
+    found = open_depth(describe(path, f'gives = "metres"\nsigma = "sigma"\n{SIZE}'))(image, CAMERA)
+    np.testing.assert_allclose(found.sigma_log, 0.1 * found.depth_m, rtol=1e-5)
+
+
+def always(number):
+    """A network that gives one number, whatever it sees."""
+    nodes = [node("Mul", "depth none", "zero"), node("Add", "zero number", "out")]
+    return {"nodes": nodes, "output": "out", "constants": {"none": 0.0, "number": number}}
+
+
+ROWS = {"nodes": [node("Reshape", "depth rows", "out")], "output": "out"}
+
+
+@pytest.mark.parametrize(
+    ("network", "text", "words"),
+    [
+        ({"size": (64, 96)}, SIZE, "images of 64x96"),
+        ({"size": (4096, 4096)}, "", "input_height must be from"),
+        ({"channels": 4}, SIZE, r"expected \[1, 3, H, W\]"),
+        ({**ROWS, "constants": {"rows": np.array([1, 1, 126, -1])}}, SIZE, "cannot be run on 112x112 pixels"),
+        (always(np.nan), SIZE, "gives no depth"),
+        (always(-9.0), SIZE, "gives no depth"),
+        (always(2.0), SIZE, "the same depth for different images"),
+    ],
+)
+def test_network_that_cannot_give_depth_is_one_line(tmp_path, network, text, words):
+    path = describe(green_network(tmp_path / "net.onnx", **network), f'gives = "metres"\n{text}')
+    with pytest.raises(WeightsError, match=words):
+        open_depth(path)
+
+
+def test_non_finite_pixels_are_unknown(tmp_path, image):
+    """The logarithm of what is black after a shift is no number: those pixels alone have no depth."""
+    nodes = [node("Sub", "depth near2", "less"), node("Log", "less", "log"), node("Exp", "log", "again")]
+    path = green_network(tmp_path / "net.onnx", nodes, "again", constants={"near2": 2.0})
+    depth = CheckedDepth(ExternalDepth(describe(path, f'gives = "metres"\n{SIZE}')))
+    found = depth(image, CAMERA)
+    assert np.isnan(found.depth_m[:, :90]).all()
+    np.testing.assert_allclose(found.depth_m[:, 112:], FAR_M - 2.0, rtol=1e-4)
+
+
+def test_constant_output_gives_no_relative_depth():
+    for value in (3.0, np.nan, 0.0):
+        assert np.isnan(relative_depth(np.full((4, 4), value, np.float32))).all()
+
+
+def test_a_preset_can_be_corrected(tmp_path, image):
+    path = describe(green_network(tmp_path / "n.onnx"), 'preset = "metric3d-v2-small"\ndepth = ""\nmultiple = 14\n')
+    assert open_depth(path).network.multiple == 14
+
+
+def test_input_of_any_size_gets_a_default_with_a_remark(tmp_path, caplog):
+    network = open_depth(describe(green_network(tmp_path / "net.onnx"), 'gives = "metres"\nmultiple = 14\n'))
+    assert network.network.input_height == network.network.input_width == 518
+    assert "say input_height and input_width" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "record",
+    ['{"gives": ["metres"]}', '{"gives": "metres", "preset": []}', '{"gives": "metres", "mean": [[1], 2, 3]}', "[[[["],
+)
+def test_record_of_odd_types_is_one_line(tmp_path, record):
+    model = onnx.load(green_network(tmp_path / "net.onnx"))
+    model.metadata_props.add(key="edgeslam.depth", value=record)
+    onnx.save(model, tmp_path / "net.onnx")
+    with pytest.raises(WeightsError):
+        open_depth(tmp_path / "net.onnx")

@@ -27,3 +27,10 @@ def test_the_nearest_pixels_are_a_trees(rng, count):
     apart, true = cKDTree(uv).query(query, k=[*range(1, count + 1)])
     np.testing.assert_array_equal(nearest, true)
     np.testing.assert_allclose(distance, apart, rtol=1e-12)
+
+
+def test_nothing_is_near_nothing():
+    grid = KeypointGrid(np.zeros((0, 2), np.float32))
+    assert len(grid) == 0
+    assert [len(side) for side in grid.near(np.zeros((5, 2)), np.ones(5))] == [0, 0]
+    assert [len(side) for side in KeypointGrid(np.ones((3, 2))).near(np.zeros((0, 2)), np.ones(0))] == [0, 0]

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import pytest
 from rendered import CAMERA, patchwork, views
 
 from edgeslam_torch.config import OrbConfig
@@ -75,3 +76,32 @@ def test_spread_keeps_the_few_corners_of_a_weakly_textured_region(rng):
     assert len(keep) == 500
     assert (np.diff(keep) > 0).all()
     assert (keep >= 2000).sum() == 12
+
+
+@pytest.mark.parametrize("grey", [0, 128, 255])
+def test_constant_image_has_no_keypoints(grey):
+    features = OrbExtractor(OrbConfig(), CAMERA)(np.full((240, 320), grey, np.uint8))
+    assert features.uv.shape == (0, 2)
+    assert features.descriptors.shape == (0, 32)
+    assert len(features.octave) == len(features.angle_rad) == 0
+
+
+def test_with_many_corners_faint_ones_change_nothing():
+    grey = views()[0][..., 1].copy()
+    config = OrbConfig(features=400)
+    a, b = (OrbExtractor(c, CAMERA)(grey) for c in (config, OrbConfig(features=400, fast_faint=12)))
+    np.testing.assert_array_equal(a.uv, b.uv)
+
+
+def test_spread_takes_the_strongest_of_a_cell():
+    uv = np.tile([[10.0, 10.0]], (9, 1)).astype(np.float32)
+    assert spread(uv, np.arange(9.0), 640, 480, 3).tolist() == [6, 7, 8]
+
+
+def test_spread_is_as_even_as_the_corners_allow(rng):
+    """Evenly detected corners: no quarter of the image gets more than a third of what is kept."""
+    uv = rng.uniform([0, 0], [640, 480], (3000, 2)).astype(np.float32)
+    score = 100.0 - uv[:, 0] / 10  # the left is stronger throughout
+    keep = spread(uv, score, 640, 480, 600)
+    quarter = (uv[keep] // [320, 240]) @ [1, 2]
+    assert np.bincount(quarter.astype(int), minlength=4).max() < 200

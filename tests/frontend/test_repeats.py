@@ -60,3 +60,17 @@ def test_a_static_image_is_recognised_after_encoding(rng, tmp_path):
     found, warning = seen(images)
     assert np.mean(found) > 0.9
     assert "froze" in warning
+
+
+def test_copies_made_for_the_frame_rate_are_named_without_a_warning(rng):
+    """12 images per second shown at 24; a Kinect that drops images repeats some 10 %."""
+    images = [noisy(rng, room(rng), 1.0) for _ in range(12)]
+    found, warning = seen([image for image in images for _ in range(2)], 24.0)
+    assert found == [False, True] * 12
+    assert warning is None
+
+
+def test_several_stretches_give_one_warning(rng):
+    still, other = room(rng), room(rng)
+    _, warning = seen([still] * 30 + [other] * 45)
+    assert "froze 2 times, the longest from 101.0 to 102.5 s" in warning

@@ -55,3 +55,22 @@ def test_mounted_camera_looks_down_by_its_tilt():
     np.testing.assert_allclose(T_b_c[:3, :3] @ T_b_c[:3, :3].T, np.eye(3), atol=1e-15)
     assert np.linalg.det(T_b_c[:3, :3]) > 0
     np.testing.assert_allclose(T_b_c[:3, 3], [0.03, 0.0, 0.0])
+
+
+def test_undistorted_image_shows_a_point_where_undistorted_points_say():
+    camera = PRESETS["tum_fr1"]
+    image = np.zeros((480, 640), np.uint8)
+    at = np.array([[100.0, 90.0]])
+    cv2.circle(image, (100, 90), 6, 255, -1, cv2.LINE_AA)
+    v, u = np.nonzero(camera.undistort_image(image) > 127)
+    np.testing.assert_allclose([u.mean(), v.mean()], camera.undistort_points(at)[0], atol=0.35)
+
+
+def test_camera_without_distortion_changes_nothing(rng):
+    uv = rng.uniform(0, 480, (5, 2)).astype(np.float32)
+    image = rng.integers(0, 255, (480, 640), dtype=np.uint8)
+    np.testing.assert_array_equal(CAMERA.undistort_points(uv), uv)
+    assert CAMERA.undistort_image(image) is image
+    assert CAMERA.undistort_points(np.zeros((0, 2))).shape == (0, 2)
+    np.testing.assert_array_equal(CAMERA.distort_points(uv), uv)
+    assert CAMERA.distort_points(np.zeros((0, 2))).shape == (0, 2)

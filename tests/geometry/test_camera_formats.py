@@ -226,3 +226,28 @@ def test_unsupported_content_is_rejected_in_one_line(tmp_path, text):
         _read(tmp_path, text)
     assert "\n" not in str(raised.value)
     assert len(str(raised.value)) < 500 + len(str(tmp_path))
+
+
+def test_a_file_without_a_size_needs_images(tmp_path):
+    with pytest.raises(CalibrationError, match="width and height"):
+        _read(tmp_path, FORMATS["dpvo"], size=None)
+
+
+def test_an_angle_of_the_fov_model_is_fitted(tmp_path):
+    camera, remarks = _read(tmp_path, "1.2 1.875 0.5 0.5 0.5\n752 480\ncrop\n640 480\n")
+    r = np.arctan(2 * 0.3 * np.tan(0.25)) / 0.5
+    uv = camera.project_through_lens(np.array([[0.3, 0.0, 1.0]]))
+    assert uv[0] == pytest.approx((375.5 + 1.2 * 752 * r, 239.5), abs=0.3)
+    assert any("px off" in remark for remark in remarks)
+
+
+def test_unknown_keys_are_named(tmp_path):
+    assert any("exposure" in remark for remark in _read(tmp_path, OWN + "exposure: 3\n")[1])
+
+
+def test_a_huge_file_is_not_read(tmp_path):
+    path = tmp_path / "camera.yaml"
+    with path.open("wb") as file:
+        file.truncate(200_000_000)
+    with pytest.raises(CalibrationError, match="200 MB"):
+        read_camera(path)

@@ -5,7 +5,7 @@ import pytest
 from point_map import PointMap
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.map.depth_prior import depth_prior, fit_to_anchors
+from edgeslam_torch.map.depth_prior import depth_prior, fit_to_anchors, sample
 from edgeslam_torch.types import DepthMap
 
 
@@ -89,3 +89,44 @@ def test_relative_depth_is_fitted_by_scale_and_shift(points):
     assert known.mean() > 0.9
     np.testing.assert_allclose(prior[known], z[known], rtol=0.02)
     assert np.median(sigma) < 0.1
+
+
+def test_sampling_takes_the_nearest_pixel_and_preserves_holes():
+    depth = np.array([[1.0, 2.0, 0.0], [4.0, np.nan, 6.0]], np.float32)
+    sigma = np.full((2, 3), 0.25, np.float32)
+    uv = np.array([[0.4, 0.4], [0.6, 0.0], [2.0, 0.0], [1.0, 1.0], [9.0, 9.0], [-3.0, 1.0]])
+    z, s = sample(DepthMap(depth, sigma), uv)
+    np.testing.assert_array_equal(z, [1.0, 2.0, np.nan, np.nan, 6.0, 4.0])
+    np.testing.assert_allclose(s, 0.25)
+
+
+def test_fit_finds_the_ratio_despite_a_third_of_outliers(rng):
+    network = rng.uniform(0.5, 5.0, 60)
+    anchors = 2.5 * network
+    anchors[:20] *= rng.uniform(0.2, 0.6, 20)
+    fit = fit_to_anchors(network, anchors)
+    assert fit.anchors == 60
+    assert fit.log_ratio == pytest.approx(np.log(2.5))
+    assert fit.sigma_log == 0.02  # its floor: most agree exactly
+
+
+def test_keyframe_without_anchors_has_a_wide_prior(points):
+    keyframe = points.keyframes[0]
+    keyframe.anchor[:] = -1
+    prior, sigma = depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors)
+    assert np.isnan(prior).all()
+    assert np.isinf(sigma).all()
+
+
+def test_anchors_behind_the_camera_do_not_count(points):
+    keyframe = points.keyframes[0]
+    keyframe.T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ keyframe.T_c_w
+    assert np.isnan(depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors)[0]).all()
+
+
+def test_anchors_from_relative_depth_do_not_fit_its_scale(points):
+    keyframe = points.keyframes[0]
+    keyframe.depth = relative_map(points, 0)
+    points.map.anchors.from_depth[:] = True
+    _, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors)
+    np.testing.assert_allclose(sigma, 0.35)

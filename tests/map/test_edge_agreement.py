@@ -59,3 +59,12 @@ def test_without_overlap_the_default_applies(rng, case):
             view.T_w_c[:3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
         views = views[:4]
     assert bend(views, CAMERA) == DEFAULT_BEND
+
+
+def test_consistent_views_have_no_drift(rng):
+    assert bend(flight(rng, np.zeros(20)), CAMERA) < 1e-6
+
+
+def test_a_common_error_is_unobservable(rng):
+    """Which is why `SHARED` is more than one."""
+    assert bend(flight(rng, np.full(20, 0.1)), CAMERA) < 0.01

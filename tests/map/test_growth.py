@@ -43,3 +43,12 @@ def test_anchors_are_expected_on_the_same_pyramid_level_and_depth(points, factor
     np.testing.assert_allclose(anchors.prior[ids], np.tile([0.5 / factor, 0.1 / factor], (len(ids), 1)))
     np.testing.assert_allclose(anchors.origin[ids], np.tile(host.centre_w, (len(ids), 1)))
     check_map(points.map)
+
+
+def test_a_keyframe_with_few_anchors_gives_no_estimate(points):
+    before = depths(points.map, points.keyframes[:1])
+    held, z = before[0]
+    far = points.map.anchors.max_distance.copy()
+    grow(points, 2.0)
+    take_along(points.map, points.keyframes[:1], {0: (held[:5], z[:5])})
+    np.testing.assert_array_equal(points.map.anchors.max_distance, far)

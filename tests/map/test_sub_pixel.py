@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rendered import CAMERA, film, sideways, stairs_world
+from rendered import CAMERA, film, sideways, stairs_world, wall
 
 from edgeslam_torch.config import OrbConfig
 from edgeslam_torch.frontend.image import as_grey
@@ -11,7 +11,8 @@ from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.map.sub_pixel import align
+from edgeslam_torch.map.sub_pixel import SIGMA_PX, align
+from edgeslam_torch.synthetic.house.world import World
 
 SCALE = 1.2
 
@@ -86,3 +87,40 @@ def test_a_mismatched_keypoint_is_not_aligned(seen):
     align(slam_map, second, CAMERA)
     as_they_were = np.isnan(second.aligned_px[wrong])
     assert as_they_were.mean() > 0.9
+
+
+def test_sigmas_include_the_limit_and_the_noise(seen):
+    slam_map, (first, second, _) = seen
+    align(slam_map, second, CAMERA)
+    aligned = np.isfinite(second.aligned_px)
+    limit = SIGMA_PX * SCALE ** second.features.octave[aligned]
+    assert (second.aligned_px[aligned] > limit).all() and (second.aligned_px[aligned] < np.hypot(limit, 0.5)).all()
+    partners = np.isin(first.anchor, second.anchor[aligned])
+    assert first.aligned_px[partners] == pytest.approx(SIGMA_PX * SCALE ** first.features.octave[partners])
+    assert np.isnan(first.aligned_px[~partners]).all()
+
+
+def test_a_view_from_half_as_far_is_aligned_as_well():
+    """Depths of 2 m, then of 1.2: patches have grown by a half and more."""
+    rng = np.random.default_rng(1)
+    flight = film(World([wall(rng, 2.4, 3.0, 1024)]), CAMERA, sideways(2, 0.05, forward_m=0.9))
+    slam_map, keyframes = a_map(flight)
+    align(slam_map, keyframes[1], CAMERA)
+    aligned = np.flatnonzero(np.isfinite(keyframes[1].aligned_px))
+    assert len(aligned) > 40 and np.median(off_px(slam_map, keyframes[1], aligned)) < 0.25
+
+
+def test_without_an_image_nothing_is_aligned(seen):
+    slam_map, (first, second, _) = seen
+    second.grey = None
+    before = second.features.uv.copy()
+    assert align(slam_map, second, CAMERA) == 0 and np.array_equal(second.features.uv, before)
+    second.grey, first.grey = first.grey, None
+    assert align(slam_map, second, CAMERA) == 0
+    assert np.array_equal(second.features.uv, before) and np.isnan(second.aligned_px).all()
+
+
+def test_anchors_behind_a_view_are_not_aligned(seen):
+    slam_map, (first, second, third) = seen
+    slam_map.anchors.p_w[first.anchor] -= 10.0 * first.T_w_c[:3, 2]
+    assert align(slam_map, second, CAMERA) == align(slam_map, third, CAMERA) == 0

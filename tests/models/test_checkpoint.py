@@ -1,6 +1,7 @@
 """Weights on disk."""
 
 import os
+from collections import OrderedDict
 
 import pytest
 import torch
@@ -47,3 +48,36 @@ def test_a_pipe_is_no_weights_file(tmp_path, name):
     os.mkfifo(tmp_path / name)
     with pytest.raises(WeightsError, match="not a file"):
         load_checkpoint(tmp_path / name)
+
+
+def test_half_precision_halves_the_file_and_hardly_changes_depth(tmp_path):
+    network, metadata = small_network()
+    for name, half in (("full", False), ("half", True)):
+        save_checkpoint(network, metadata, tmp_path / name, half)
+    assert (tmp_path / "half").stat().st_size < 0.52 * (tmp_path / "full").stat().st_size
+    x = torch.randn(1, 3, 64, 64)
+    a, b = network.predict(x).log_depth, load_checkpoint(tmp_path / "half")[0].predict(x).log_depth
+    assert (a - b).abs().max() < 1e-2 * (1 + a.abs().max())
+
+
+def test_weights_of_ours_are_not_fed_as_others_when_their_record_is_missing(tmp_path):
+    network, _ = small_network()
+    torch.save(
+        {"state_dict": network.state_dict(), "args": {"out": tmp_path, "device": torch.device("cpu")}},
+        tmp_path / "w.pt",
+    )
+    with pytest.raises(WeightsError, match="record"):
+        load_checkpoint(tmp_path / "w.pt")
+
+
+def test_a_checkpoint_with_the_network_under_another_name_says_what_it_holds(tmp_path):
+    torch.save({"student": small_network()[0].state_dict(), "epoch": 3}, tmp_path / "w.pt")
+    with pytest.raises(WeightsError, match="student, epoch"):
+        load_checkpoint(tmp_path / "w.pt")
+
+
+def test_pickled_module_is_refused_with_the_remedy(tmp_path):
+    parts = torch.nn.Sequential(OrderedDict(FastDepth(Variant.PRUNED).named_children()))
+    torch.save({"model": parts}, tmp_path / "whole.pth.tar")
+    with pytest.raises(WeightsError, match="edgeslam weights convert"):
+        load_checkpoint(tmp_path / "whole.pth.tar")

@@ -1,9 +1,11 @@
 """Upstream's pickled checkpoints: read without running them."""
 
+import argparse
 import os
 import sys
 import types
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -65,3 +67,26 @@ def test_hostile_pickle_is_refused_and_runs_nothing(tmp_path, zipped):
     with pytest.raises(WeightsError, match="refused"):
         read_upstream(tmp_path / "evil.pth")
     assert not marker.exists()
+
+
+@pytest.mark.filterwarnings("ignore:Couldn't retrieve source")
+def test_what_training_left_beside_the_network_is_passed_over(tmp_path, upstream_class):
+    """As upstream's training script saves it: arguments, optimiser and all."""
+    network = upstream_class(FastDepth(Variant.PRUNED).eval())
+    optimiser = torch.optim.SGD(network.parameters(), 0.1, momentum=0.9)
+    content = {"args": argparse.Namespace(arch="x"), "epoch": 3, "best_result": np.float64(0.6), "optimizer": optimiser}
+    torch.save(content | {"model": network}, tmp_path / "w.pth.tar", _use_new_zipfile_serialization=False)
+    assert convert_upstream(tmp_path / "w.pth.tar", tmp_path / "out.safetensors").variant == Variant.PRUNED.value
+
+
+def test_damaged_files_are_named(tmp_path, rng):
+    torch.save(FastDepth(Variant.PRUNED).state_dict(), tmp_path / "w.pt", _use_new_zipfile_serialization=False)
+    whole = (tmp_path / "w.pt").read_bytes()
+    for cut in (0, 1, 20, 3000, len(whole) // 2, len(whole) - 3):
+        (tmp_path / "cut.pt").write_bytes(whole[:cut])
+        with pytest.raises(WeightsError, match=r"cut\.pt"):
+            read_upstream(tmp_path / "cut.pt")
+    for _ in range(50):
+        (tmp_path / "noise.pt").write_bytes(rng.integers(0, 256, 200, dtype="uint8").tobytes())
+        with pytest.raises(WeightsError, match=r"noise\.pt"):
+            read_upstream(tmp_path / "noise.pt")

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from edgeslam_torch.config import DepthConfig
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.frontend.depth_network import DepthPredictor, open_depth
 from edgeslam_torch.frontend.onnx_session import open_session
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
+from edgeslam_torch.models.device import find_device, onnx_providers
 from edgeslam_torch.models.fastdepth import Widths
+from edgeslam_torch.models.onnx.fold import deployed
 from edgeslam_torch.models.record import Metadata
 
 METADATA = Metadata(input_height=64, input_width=96, focal_px=80.0)
@@ -92,3 +95,20 @@ def test_cuda_gives_the_processors_depth(weights, image):
     there, here = (DepthPredictor(weights, "torch", device=device) for device in ("cuda", "cpu"))
     assert there.backend.startswith("torch on cuda")
     np.testing.assert_allclose(there(image, CAMERA).depth_m, here(image, CAMERA).depth_m, rtol=1e-3)
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:1", ""])
+def test_other_names_are_refused(weights, device):
+    for ask in (find_device, onnx_providers, lambda name: open_depth(weights, device=name)):
+        with pytest.raises(ConfigError, match="there are auto, cpu, cuda, mps"):
+            ask(device)
+    with pytest.raises(ValueError, match="device must be auto, cpu, cuda or mps"):
+        DepthConfig(device=device)
+
+
+def test_the_deployed_network_leaves_nothing_on_the_processor():
+    """On the meta device, tensors have no values: one that was left elsewhere would not go with them."""
+    network = deployed(build_network(METADATA, SMALL), METADATA).to("meta")
+    log_depth, sigma = network(torch.zeros(1, 3, 64, 96, device="meta"))
+    assert log_depth.shape == sigma.shape == (1, 1, 32, 48)
+    assert log_depth.device.type == sigma.device.type == "meta"

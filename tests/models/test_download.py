@@ -13,7 +13,7 @@ import pytest
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.files import download as fetching
 from edgeslam_torch.files.download import KeepEncryption, remember, remembered
-from edgeslam_torch.models.download import download
+from edgeslam_torch.models.download import cache_folder, download
 
 CONTENT = bytes(range(256)) * 700
 
@@ -124,3 +124,35 @@ def test_a_server_that_accepts_and_says_nothing_is_given_up(tmp_path, monkeypatc
         url = f"http://127.0.0.1:{silent.getsockname()[1]}/x"
         with pytest.raises(TimeoutError, match="no answer"):
             fetching.fetch(url, tmp_path / "part", 1 << 30)
+
+
+def test_second_url_is_tried_and_checksum_returned(server, tmp_path):
+    seen = []
+    fetched = download(
+        (f"{server}/missing", f"{server}/file"), tmp_path / "w", progress=lambda have, total: seen.append((have, total))
+    )
+    assert (tmp_path / "w").read_bytes() == CONTENT
+    assert fetched.sha256 == hashlib.sha256(CONTENT).hexdigest()
+    assert seen[-1] == (len(CONTENT), len(CONTENT))
+
+
+def test_kept_checksum_is_what_sha256sum_reads(tmp_path):
+    digest = hashlib.sha256(CONTENT).hexdigest()
+    assert remembered(tmp_path / "w") is None
+    remember(tmp_path / "w", digest)
+    assert (tmp_path / "w.sha256").read_text() == f"{digest}  w\n"
+    assert remembered(tmp_path / "w") == digest
+
+
+def test_a_server_without_http_is_one_line(server, tmp_path):
+    with pytest.raises(WeightsError, match="download failed") as caught:
+        download((f"{server}/garbage",), tmp_path / "w")
+    assert "\n" not in str(caught.value)
+
+
+def test_cache_folder_follows_the_environment(monkeypatch, tmp_path):
+    monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path))
+    assert cache_folder() == tmp_path
+    monkeypatch.delenv("EDGESLAM_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "x"))
+    assert cache_folder() == tmp_path / "x" / "edgeslam"

@@ -3,8 +3,10 @@
 import pytest
 import torch
 
+from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.complexity import measure_complexity
-from edgeslam_torch.models.fastdepth import FastDepth, Output, Variant
+from edgeslam_torch.models.fastdepth import FULL, PRUNED, FastDepth, Output, Variant, Widths
+from edgeslam_torch.models.mobilenet import SameConv2d
 
 
 @pytest.mark.parametrize(
@@ -47,3 +49,31 @@ def test_any_multiple_of_32_keeps_its_size(size, output):
     assert log_sigma is not None
     if output is Output.LOG_DEPTH:
         torch.testing.assert_close(log_depth.exp(), depth)
+
+
+@pytest.mark.parametrize("variant", [Variant.SKIPADD, Variant.PRUNED, Variant.NNCONV5DW])
+def test_widths_come_back_from_a_state_dict(variant):
+    expected = PRUNED if variant is Variant.PRUNED else FULL
+    assert Widths.of_state_dict(FastDepth(variant).state_dict()) == expected
+
+
+def test_widths_of_something_else_are_refused():
+    with pytest.raises(WeightsError, match="not a FastDepth"):
+        Widths.of_state_dict({"fc.weight": torch.zeros(3)})
+
+
+def test_other_sizes_are_refused():
+    with pytest.raises(ValueError, match="multiples of 32"):
+        FastDepth(Variant.PRUNED)(torch.zeros(1, 3, 224, 230))
+
+
+def test_same_padding_centres_on_odd_pixels():
+    """TensorFlow pads an even input at stride 2 on the right only: output 0 sees inputs 0, 1, 2."""
+    layer = SameConv2d(1, 1, 3, 2, 0, bias=False)
+    torch.nn.init.ones_(layer.weight)
+    x = torch.zeros(1, 1, 4, 4)
+    x[0, 0, 0, 0] = 1.0
+    assert layer(x)[0, 0].tolist() == [[1.0, 0.0], [0.0, 0.0]]
+    x = torch.zeros(1, 1, 4, 4)
+    x[0, 0, 2, 2] = 1.0
+    assert layer(x)[0, 0].tolist() == [[1.0, 1.0], [1.0, 1.0]]

@@ -15,8 +15,10 @@ import pytest
 import torch
 from torch import nn
 
+from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.convert import read_upstream
 from edgeslam_torch.models.fastdepth import FastDepth, Variant
+from edgeslam_torch.models.inert_pickle import Call, InertPickle, Name
 
 MAGIC = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."
 PROTOCOL = b"\x80\x02M\xe9\x03."
@@ -222,3 +224,16 @@ def test_strided_and_shared_tensors_are_those_that_torch_reads(tmp_path):
         read, _ = read_upstream(tmp_path / "w.pth")
         for name, tensor in torch.load(tmp_path / "w.pth", weights_only=True).items():
             np.testing.assert_array_equal(read[name], tensor.numpy())
+
+
+def test_a_module_inside_itself_ends(tmp_path):
+    itself = b"ctorch.nn.modules.container\nSequential\n)\x81q\x00" + table("_modules", table("0", b"h\x00")) + b"b"
+    (tmp_path / "w.pth").write_bytes(legacy(itself))
+    with pytest.raises(WeightsError, match="more than 5000 modules"):
+        read_upstream(tmp_path / "w.pth")
+
+
+def test_nothing_is_looked_up_or_called():
+    """Even an allowed name is not resolved."""
+    program = b"\x80\x02cos\nsystem\n" + text("exit 1") + b"\x85R."
+    assert InertPickle(program, lambda name: True).load() == Call(Name("os", "system"), ("exit 1",))

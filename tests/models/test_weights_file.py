@@ -205,3 +205,7 @@ def test_empty_missing_and_foreign_files_are_named(tmp_path):
     with (tmp_path / "huge").open("wb") as huge:
         huge.truncate(1 << 33)
     refused(tmp_path / "huge")
+
+
+def test_fields_of_newer_files_are_ignored():
+    assert metadata_from_json(json.dumps(asdict(METADATA) | {"lens": "fisheye"})) == METADATA

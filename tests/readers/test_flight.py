@@ -1,6 +1,7 @@
 import pytest
 
 from edgeslam_torch.readers.flight_folder import telemetry_gap
+from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.types import TelemetrySample
 
 
@@ -34,3 +35,15 @@ def test_telemetry_of_another_time_is_said_with_both_clocks(begin_s, end_s, word
 def test_half_a_video_without_telemetry_is_counted(told, missing_s):
     warning = telemetry_gap(told, 100.0, 130.0)
     assert f"no telemetry during {missing_s:.1f} of 30.0 s" in warning
+
+
+def test_no_telemetry_at_all_is_no_gap():
+    assert telemetry_gap([], 100.0, 130.0) is None
+
+
+def test_an_empty_telemetry_file_is_a_warning_of_the_source(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "seq", 3)
+    (folder / "telemetry.csv").write_text("stamp_s,vgx,vgy,vgz,pitch,roll,yaw\n")
+    source = open_source(folder)
+    assert source.telemetry == []
+    assert any("telemetry.csv: holds no state message" in w for w in source.warnings)

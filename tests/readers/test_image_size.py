@@ -59,3 +59,9 @@ def test_size_by_the_formats_own_words(data, size):
 def test_any_bytes_have_a_size_or_none(begin, rest):
     size = image_size(begin + rest)
     assert size is None or min(size) >= 0
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_cut_off_headers_have_no_size_or_the_right_one(name):
+    data = encoded(name, WRITTEN[name])
+    assert all(image_size(data[:n]) in (None, (67, 45)) for n in range(200))

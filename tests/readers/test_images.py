@@ -129,3 +129,15 @@ def test_the_size_of_most_images_is_the_recordings(tmp_path, odd):
         cv2.imwrite(str(entries[i].path), picture()[: 32 + i])
     with pytest.raises(SourceError, match="here: images of several sizes"):
         usual_size(entries, "here")
+
+
+def test_a_grey_jpeg_stays_grey(entry):
+    frame = read_frame(entry("a.jpg", picture()[:, :, 0]))
+    np.testing.assert_array_equal(frame.image, frame.grey)
+
+
+def test_a_file_too_large_for_an_image_is_not_read(tmp_path):
+    with (tmp_path / "a.png").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(SourceError, match="a.png: 1099512 MB is too large for an image"):
+        read_image(tmp_path / "a.png")

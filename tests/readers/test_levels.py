@@ -51,3 +51,8 @@ def test_floating_point_in_0_to_1_keeps_its_contrast(dtype, brightest):
     picture = (brightest * GREY / 255).astype(dtype)
     seen = levels_of([picture]).eight_bits(picture).astype(float)
     assert np.abs(seen - brightest * GREY).max() <= 1.0
+
+
+def test_noise_of_a_first_picture_beyond_the_others_does_not_set_the_range():
+    thermal = (7000 + 1.5 * GREY).astype(np.uint16)
+    assert levels_of([(GREY / 20).astype(np.uint16), *[thermal] * 4]) == levels_of([thermal] * 4)

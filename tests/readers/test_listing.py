@@ -91,3 +91,29 @@ def test_a_list_is_read_however_a_spreadsheet_wrote_it(tmp_path, line, encoding,
     rows, problems = read_list(tmp_path / "rgb.txt")
     assert rows == [(1305031102 + i / 8, f"rgb/{i} a.png") for i in range(4)]
     assert problems == []
+
+
+def test_repeated_stamp_is_left_out_and_named():
+    kept, problems = in_order(entries([*range(10), 9, 10, 11, 12]), "rgb.txt")
+    assert len(kept) == 13
+    assert "repetition" in problems[0].reason
+
+
+def test_shuffled_list_is_sorted(rng):
+    stamps = rng.permutation(50)
+    kept, problems = in_order(entries(stamps), "rgb.txt")
+    assert [e.stamp_s for e in kept] == sorted(stamps)
+    assert problems == [
+        Problem("rgb.txt", "lists images in no order of their stamps; they are used sorted by stamp", 0)
+    ]
+
+
+def test_stamps_in_no_unit_are_said():
+    kept, problems = entries_in_time(np.arange(5) * 1e-5, [Path(f"{i}.png") for i in range(5)], "rgb.txt")
+    assert len(kept) == 5
+    assert "no unit" in problems[0].reason
+
+
+def test_identical_stamps_are_named_as_the_cause():
+    with pytest.raises(SourceError, match=r"rgb.txt: 40 images have only 4 different stamps"):
+        in_order(entries(np.arange(40) // 10 + 1305031102), "rgb.txt")

@@ -8,7 +8,7 @@ from edgeslam_torch.cli import main
 from edgeslam_torch.drone.emulator.server import TelloEmulator
 from edgeslam_torch.drone.video_stream import Picture
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.readers.live import LiveSource
+from edgeslam_torch.readers.live import LiveSource, open_live
 
 
 class FakeFeed:
@@ -89,3 +89,29 @@ def test_emulator_ends_whichever_of_its_threads_gets_the_signal(capsys, monkeypa
     monkeypatch.setattr(TelloEmulator, "start", shot)
     ports = ["--command-port", "0", "--state-port", "1", "--video-port", "1"]
     assert main(["sim", *ports, "--render-width", "64"]) == 0
+
+
+def test_device_is_given_back_when_the_taker_stops_early():
+    feed = FakeFeed(range(1, 50))
+    frames = LiveSource("webcam:0", feed, [], None, None, is_drone=False).frames()
+    next(frames)
+    frames.close()
+    assert feed.closed == 1
+
+
+def test_no_picture_is_an_error_and_gives_the_device_back():
+    feed = FakeFeed([])
+    with pytest.raises(SourceError, match="no picture"):
+        LiveSource("rtsp://somewhere", feed, [], None, None, is_drone=False)
+    assert feed.closed == 1
+
+
+@pytest.mark.parametrize("spec", ["webcam:", "webcam:front", "webcam:-1"])
+def test_webcams_are_numbered(spec):
+    with pytest.raises(SourceError, match="webcam:N"):
+        open_live(spec)
+
+
+def test_flying_needs_a_drone(capsys):
+    assert main(["record", "webcam:0", "--fly"]) == 1
+    assert "--fly" in capsys.readouterr().err

@@ -75,3 +75,11 @@ def test_gstreamer_pipeline():
         open_live("gst:nosuchsource")
     with pytest.raises(SourceError, match="even"):
         open_live("gst:videotestsrc ! video/x-raw,width=161,height=120")
+
+
+def test_gstreamer_that_is_not_installed_is_named(monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    with pytest.raises(SourceError, match="gstreamer1.0-tools"):
+        open_live("gst:videotestsrc")
+    with pytest.raises(SourceError, match="give a pipeline"):
+        open_live("gst:")

@@ -6,6 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.source import open_source
 
 av = pytest.importorskip("av")
@@ -74,3 +75,23 @@ def test_a_turned_phone_gives_upright_pictures(tmp_path, a, b, bright):
     sides = {"left": middle[0][3], "right": middle[0][-4], "top": middle[1][3], "bottom": middle[1][-4]}
     assert sides[bright] > 180 and {side for side, value in sides.items() if value > 180} >= {bright}
     assert sides[{"top": "bottom", "bottom": "top", "right": "left"}[bright]] < 60
+
+
+def test_a_cut_file_is_still_said_to_be_damaged(tmp_path):
+    path = _write(tmp_path / "a.mkv", stamps_ms=[33 * i for i in range(90)])
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    source = open_source(path)
+    count = len(list(source.frames()))
+    assert 0 < count < 80 and "damaged" in source.problems[-1].reason
+
+
+def test_raw_panoramas_of_an_insta360_are_refused_with_advice(tmp_path):
+    for name in ("VID_01.insv", "a.360"):
+        (tmp_path / name).write_bytes(b"x" * 100)
+        with pytest.raises(SourceError, match="export a flat video"):
+            open_source(tmp_path / name)
+
+
+def test_a_picture_twice_as_wide_as_high_is_doubted(tmp_path, write_images):
+    (path,) = write_images(tmp_path, ["pano.png"], size=(512, 256))
+    assert any("panorama" in warning for warning in open_source(path).warnings)

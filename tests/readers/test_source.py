@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.errors import SourceError
+from edgeslam_torch.errors import CalibrationError, SourceError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.source import open_source
@@ -194,3 +194,103 @@ def test_an_imu_beside_the_images_is_used_unless_the_user_says_otherwise(tmp_pat
 def test_the_length_of_a_part_is_the_number_of_its_frames(tmp_path, write_tum, start, stride, most):
     part = open_source(write_tum(tmp_path / "seq", 12), max_frames=most).part(start, stride)
     assert part.length == len(list(part.frames()))
+
+
+def test_frames_can_be_had_again_and_are_the_same(tmp_path, write_tum):
+    source = open_source(write_tum(tmp_path, 4))
+    first, second = list(source.frames()), list(source.frames())
+    assert all(np.array_equal(a.image, b.image) and a.stamp_s == b.stamp_s for a, b in zip(first, second, strict=True))
+
+
+def test_seven_scenes_frame_that_is_there_twice_is_used_once(tmp_path, write_images):
+    names = ["frame-000000.color.png", "frame-000001.color.png", "frame-000001.color.jpg", "frame-²2.color.png"]
+    write_images(tmp_path, names, (640, 480))
+    source = open_source(tmp_path)
+    assert [round(30 * f.stamp_s) for f in source.frames()] == [0, 1]
+    assert [p.frames for p in source.problems] == [1, 1]
+
+
+def test_recorded_video_with_its_own_stamps(video):
+    video.with_name("clip_stamps.txt").write_text("".join(f"{5.0 + 0.1 * i} {i}\n" for i in range(8)))
+    assert [f.stamp_s for f in open_source(video.parent).frames()] == pytest.approx([5.0 + 0.1 * i for i in range(8)])
+
+
+def test_video_of_too_many_pixels_is_refused(video, monkeypatch):
+    monkeypatch.setattr("edgeslam_torch.readers.images.MAX_PIXELS", 64 * 48 - 1)
+    with pytest.raises(SourceError, match="clip.avi: image is 64x48, more than"):
+        open_source(video)
+
+
+def test_malformed_lines_of_a_list_are_named(tmp_path, write_tum):
+    folder = write_tum(tmp_path, 3)
+    with (folder / "rgb.txt").open("a") as file:
+        file.write("what is this\n101.0\nnan rgb/x.png\n")
+    source = open_source(folder)
+    assert source.length == 3
+    assert len(source.problems) == 3
+    assert source.problems[0].file.endswith("rgb.txt:5")
+
+
+def test_sixteen_bit_and_alpha_images_become_eight_bit(tmp_path):
+    cv2.imwrite(str(tmp_path / "1.png"), np.full((48, 64), 0x8000, dtype=np.uint16))
+    cv2.imwrite(str(tmp_path / "2.png"), np.full((48, 64, 4), 7, dtype=np.uint8))
+    frames = list(open_source(tmp_path).frames())
+    assert frames[0].image.dtype == np.uint8
+    assert frames[0].image[0, 0] == 128
+    assert frames[1].image.shape == (48, 64, 3)
+
+
+def test_one_image_is_a_source(tmp_path, write_images):
+    (path,) = write_images(tmp_path, ["only.png"])
+    assert [f.index for f in open_source(path).frames()] == [0]
+
+
+def test_given_calibration_wins_over_the_sources_own(tmp_path, write_tum):
+    folder = write_tum(tmp_path, 2, (640, 480))
+    save_camera(folder / "camera.yaml", Camera(640, 480, 50.0, 50.0, 320.0, 240.0))
+    assert open_source(folder, camera="kinect").camera.fx == 525.0
+
+
+def test_calibration_of_another_resolution_is_scaled_and_says_so(tmp_path, write_tum):
+    source = open_source(write_tum(tmp_path, 2, (320, 240)), camera="kinect")
+    assert source.camera.fx == pytest.approx(262.5)
+    assert "scaled from 640x480 to 320x240" in source.camera.source
+    assert source.warnings
+
+
+def test_calibration_of_another_shape_is_refused_naming_both_sizes(tmp_path, write_tum):
+    with pytest.raises(CalibrationError, match="640x480.*960x540"):
+        open_source(write_tum(tmp_path, 2, (960, 540)), camera="kinect")
+
+
+def test_the_small_copy_beside_a_video_is_no_second_one(tmp_path):
+    write_y4m(tmp_path / "GX010001.mp4", 3)
+    write_y4m(tmp_path / "GL010001.lrv", 2)
+    assert len(list(open_source(tmp_path).frames())) == 3
+
+
+def test_stamps_beside_a_video_may_be_nanoseconds(tmp_path):
+    write_y4m(tmp_path / "clip.y4m", 3)
+    (tmp_path / "clip_stamps.txt").write_text("".join(f"{50_000_000 * i} {i}\n" for i in range(3)))
+    source = open_source(tmp_path)
+    assert [frame.stamp_s for frame in source.frames()] == pytest.approx([0.0, 0.05, 0.1])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (640, 8), (16, 480)])
+def test_images_too_small_to_be_tracked_are_refused(tmp_path, write_images, size):
+    write_images(tmp_path, ["1.png", "2.png"], size)
+    with pytest.raises(SourceError, match="too small"):
+        open_source(tmp_path)
+
+
+def test_a_picture_beside_the_folder_of_images_is_not_the_recording(tmp_path, write_images):
+    write_images(tmp_path, ["title.png"])
+    write_images(tmp_path / "frames", [f"{i}.png" for i in range(5)])
+    with pytest.raises(SourceError, match="5 in its folder frames"):
+        open_source(tmp_path)
+
+
+def test_a_mistyped_name_is_answered_with_the_one_that_is_there(tmp_path):
+    (tmp_path / "tum_fr1_xyz").mkdir()
+    with pytest.raises(SourceError, match=r"no such file or folder; did you mean .*tum_fr1_xyz\?"):
+        open_source(tmp_path / "tum_fr1_xy")

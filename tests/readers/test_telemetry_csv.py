@@ -10,6 +10,7 @@ from edgeslam_torch.drone.sdk_state import FIELDS, parse_state, sample_from_sdk
 from edgeslam_torch.readers.telemetry_csv import (
     HEADER,
     TelemetryError,
+    TelemetryUnits,
     TelemetryWriter,
     detect_units,
     read_table,
@@ -267,3 +268,54 @@ def test_logs_of_other_programs_are_refused_with_a_way_to_convert_them(tmp_path,
     path.write_bytes(head)
     with pytest.raises(TelemetryError, match="stamp_s"):
         read_telemetry(path)
+
+
+@pytest.mark.parametrize(
+    ("header", "value", "said"),
+    [
+        ("vgx", 3, False),
+        ("vgx", 0.3, True),
+        ("vgx (m/s)", 0.3, False),
+        ("yaw", 0.05, True),
+        ("yaw_rad", 0.05, False),
+    ],
+)
+def test_implausible_numbers_are_reported_as_without_a_unit(tmp_path, header, value, said):
+    path = write(tmp_path, f"stamp_s,{header}\n" + "".join(f"{i / 10},{value}\n" for i in range(40)))
+    assert any("unit" in warning for warning in read_telemetry(path)[1]) is said
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_constant_height_determines_no_unit(tmp_path):
+    rows = [f"{100 * k},0,0,{2 + k % 3},100" for k in range(100)]
+    table = read_table(write(tmp_path, "\n".join(["timestamp,vx,vy,vz,tof", *rows]) + "\n"))
+    assert "too little vertical motion" in detect_units(table).evidence
+
+
+def test_units_can_be_given(tmp_path):
+    path = climbing(tmp_path, 0.1, -1)
+    assert read_telemetry(path, TelemetryUnits(0.01))[0][0].velocity_m_s[2] == pytest.approx(0.04, abs=0.001)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "count", "seconds"), [("flight_a", 2498, 253), ("flight_b", 2711, 275)])
+def test_real_flights_are_read_with_their_clock_and_units(data_dir, name, count, seconds):
+    table = read_table(data_dir / "tello_telemetry" / f"{name}.csv")
+    assert (len(table.stamps_s), table.skipped) == (count, 0)
+    assert table.stamps_s[-1] - table.stamps_s[0] == pytest.approx(seconds, abs=1.0)
+    units = detect_units(table)
+    assert (units.velocity_m_s, units.z_down) == (0.1, True)
+    samples = table.samples(units)
+    assert all(0.0 < s.battery <= 1.0 for s in samples)
+
+
+def test_stamps_in_another_unit_than_their_name_are_reported(tmp_path):
+    rows = "".join(f"{100 * k},{k}\n" for k in range(20))
+    samples, said = read_telemetry(write(tmp_path, f"stamp_s,yaw\n{rows}"))
+    assert samples[-1].stamp_s == pytest.approx(1.9)
+    assert any("milliseconds" in warning for warning in said)
+
+
+def test_a_column_without_a_number_is_named(tmp_path):
+    said = read_telemetry(write(tmp_path, "stamp_s,yaw,tof\n0,1,n/a\n0.1,1,n/a\n"))[1]
+    assert any("'tof' holds no number" in warning for warning in said)

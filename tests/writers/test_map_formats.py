@@ -18,7 +18,7 @@ from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.types import Observations, PointCloud
 from edgeslam_torch.writers.maps.colmap import write_colmap
 from edgeslam_torch.writers.maps.directions import edge_directions
-from edgeslam_torch.writers.maps.nerfstudio import write_nerfstudio
+from edgeslam_torch.writers.maps.nerfstudio import sparse_depth, write_nerfstudio
 from edgeslam_torch.writers.observations import read_observations, write_observations
 
 CAMERA = PRESETS["tum_fr1"]
@@ -140,3 +140,22 @@ def test_las_reader_gives_the_cloud_back(anchors, tmp_path):
     np.testing.assert_allclose(found.xyz, anchors.p_w, atol=6e-5)
     np.testing.assert_array_equal(np.stack([found.red, found.green, found.blue], axis=1) // 257, anchors.colour)
     np.testing.assert_array_equal(found["sigma"], anchors.sigma_m)
+
+
+def test_observations_come_back_as_they_were(seen, tmp_path):
+    write_observations(tmp_path / "o.npz", seen)
+    again = read_observations(tmp_path / "o.npz")
+    for name in ("stamps_s", "keyframe", "anchor", "uv"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(seen, name))
+
+
+def test_nearest_of_two_points_of_a_pixel_is_its_depth():
+    p_w = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 1.5], [0.0, 0.0, -1.0]])
+    uv = np.tile([[CAMERA.cx, CAMERA.cy]], (3, 1))
+    depth = sparse_depth(CAMERA, np.eye(4), p_w, uv)
+    assert depth.max() == 1500 and np.count_nonzero(depth) == 1
+
+
+def test_nerfstudio_needs_the_images(tmp_path, anchors, seen):
+    with pytest.raises(SourceError, match=r"gone\.png: cannot be read"):
+        write_nerfstudio(tmp_path, CAMERA, [tmp_path / "gone.png"] * 2, POSES, anchors, anchors, seen)

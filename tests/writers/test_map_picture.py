@@ -1,5 +1,6 @@
 import cv2
 import numpy as np
+import pytest
 
 from edgeslam_torch.types import PointCloud, Units
 from edgeslam_torch.writers.map_picture import write_map_picture
@@ -40,3 +41,12 @@ def test_far_stragglers_do_not_shrink_the_scene(tmp_path, rng):
     points = np.concatenate([rng.random((3000, 3)), [[1e5, 0, 0]]])
     write_map_picture(tmp_path / "map.png", cloud(points), path(5), Units.METRES, "")
     assert reds(cv2.imread(str(tmp_path / "map.png"))) > 3000
+
+
+@pytest.mark.parametrize(
+    ("points", "frames"),
+    [([], 1), ([], 0), ([[0, 0, 0]], 2), ([[1, 1, 1]] * 50, 3), ([[np.nan] * 3, [np.inf] * 3, [1, 2, 3]], 3)],
+)
+def test_poor_maps_still_give_a_picture(tmp_path, points, frames):
+    write_map_picture(tmp_path / "map.png", cloud(np.reshape(points, (-1, 3))), path(frames), Units.ARBITRARY, "")
+    assert cv2.imread(str(tmp_path / "map.png")) is not None

@@ -5,7 +5,10 @@ from edgeslam_torch.writers.raster_axes import (
     BACKGROUND,
     axes_around,
     draw_grid,
+    draw_path,
     draw_points,
+    text,
+    text_size,
 )
 
 
@@ -44,3 +47,39 @@ def test_the_grid_has_labelled_lines_at_round_numbers():
     zero = axes.pixels(np.zeros((1, 2)))[0].round().astype(int)
     assert changed(axes.image)[zero[1]].all() and changed(axes.image)[:, zero[0]].all()
     assert changed(picture[:, :70]).sum() > 20  # labels of the ticks on the left
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 2)), np.full((1, 2), 5.0), np.array([[np.nan, 0.0], [2.0, 2.0]])])
+def test_without_extent_there_are_axes_too(points):
+    axes = axes_around(page(), points)
+    assert np.isfinite(axes.low).all() and 0 < axes.scale < np.inf
+
+
+def test_points_outside_are_not_drawn():
+    image = page()
+    axes = axes_around(image, np.array([[0.0, 0.0], [1.0, 1.0]]))
+    draw_points(axes, np.array([[50.0, 0.5], [0.5, -1e9]]), np.ones((2, 3)), cell_px=3)
+    assert not changed(image).any()
+
+
+def test_a_path_is_drawn_without_its_gaps():
+    image = page()
+    points = np.array([[0.0, 0.0], [np.nan, 1.0], [1.0, 1.0], [1e12, 0.0]])
+    axes = axes_around(image, points[[0, 2]])
+    draw_path(axes, points, (255, 0, 0), 1)
+    assert (image[:, :, 0] > 200).sum() > 50
+
+
+@pytest.mark.parametrize("at", [(100, 60), (0, 0), (199, 119), (-500, 60)])
+def test_text_is_cut_at_the_border(at):
+    image = page()
+    text(image, "along [m]", at, 0.5, anchor=(0.5, 0.5))
+    assert changed(image).any() == (at[0] >= 0)
+
+
+def test_upright_text_is_as_high_as_it_is_long():
+    image = page(200, 200)
+    text(image, "height [m]", (100, 100), 0.5, anchor=(0.5, 0.5), upright=True)
+    v, u = np.nonzero(changed(image))
+    assert np.ptp(v) == pytest.approx(text_size("height [m]", 0.5)[0], abs=6)
+    assert np.ptp(u) < 30

@@ -1,4 +1,5 @@
 import csv
+import errno
 import json
 import math
 import os
@@ -161,3 +162,67 @@ def test_full_disk_leaves_whole_lines_and_room_for_the_rest(tmp_path, monkeypatc
     stamps, poses = slam.trajectory()
     assert writer.finish({}, stamps, poses, slam.support(), slam.edge_map(), slam.anchors(), Units.METRES) == []
     assert np.loadtxt(tmp_path / "trajectory.txt").shape == (5, 8)
+
+
+def test_rows_are_on_disk_before_the_next_frame(tmp_path):
+    writer = RunWriter(tmp_path / "out")
+    slam, frames = outputs(3)
+    for i, output in enumerate(frames):
+        writer.append(output, 2.5)
+        table = np.loadtxt(tmp_path / "out" / "trajectory.txt", ndmin=2)
+        assert table.shape == (i + 1, 8)
+    assert table[2, 0] == pytest.approx(100.0 + 2 / 30, abs=1e-6)
+
+
+def test_folder_made_for_nothing_is_gone(tmp_path):
+    RunWriter(tmp_path / "out").close()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_recording_is_refused_although_a_run_of_old_wrote_into_it(tmp_path):
+    leave_run(tmp_path)
+    (tmp_path / "rgb").mkdir()
+    with pytest.raises(OutputError, match="holds rgb, which no run wrote"):
+        RunWriter(tmp_path)
+
+
+@pytest.mark.parametrize("left", [["status.csv", "config.toml"], ["summary.json", "camera.yaml"]])
+def test_what_is_left_of_a_run_is_known_as_a_run(tmp_path, left):
+    leave_run(tmp_path / "run")
+    (tmp_path / "run" / "camera.yaml").write_text("")
+    for path in (tmp_path / "run").iterdir():
+        if path.name not in left:
+            path.unlink()
+    RunWriter(tmp_path / "run").close()
+
+
+def test_one_run_at_a_time(tmp_path):
+    first = RunWriter(tmp_path)
+    with pytest.raises(OutputError, match=f"process {os.getpid()} on .* since 20.* writes a run there"):
+        RunWriter(tmp_path)
+    first.close()
+    RunWriter(tmp_path).close()
+
+
+def test_source_folder_is_not_written_into(tmp_path):
+    with pytest.raises(OutputError, match="is the source itself"):
+        RunWriter(tmp_path, keep=[tmp_path])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_result_that_cannot_be_written_is_named_and_the_others_are_written(tmp_path, monkeypatch):
+    writer = RunWriter(tmp_path)
+    slam, frames = outputs(2)
+    replace = Path.replace
+
+    def refuse(self, target):
+        if Path(target).name == "edge_map.ply":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    stamps, poses = slam.trajectory()
+    missing = writer.finish({}, stamps, poses, slam.support(), slam.edge_map(), slam.anchors(), Units.METRES)
+    assert missing == ["edge_map.ply (No space left on device)"]
+    assert "edge_map.ply" in writer.failure
+    assert (tmp_path / "anchors.ply").exists()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from free_ports import free_ports
 
+from edgeslam_torch.cli import main
 from edgeslam_torch.drone.emulator.link import LinkFaults
 from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
 from edgeslam_torch.drone.tello import StateMessage
@@ -92,3 +93,14 @@ class ManyPictures:
 
     def close(self):
         self.closed += 1
+
+
+def test_a_folder_that_cannot_be_written_leaves_the_drone_alone(address, tmp_path, capsys):
+    (tmp_path / "rgb.txt").write_text("")
+    assert main(["run", address, "--record", str(tmp_path), "--out", str(tmp_path / "run")]) == 1
+    assert "holds rgb.txt already" in capsys.readouterr().err
+
+
+def test_a_recording_is_not_recorded_again(tmp_path, capsys):
+    assert main(["run", str(tmp_path), "--record", str(tmp_path / "x")]) != 0
+    assert "live sources" in capsys.readouterr().err

@@ -116,3 +116,20 @@ def test_any_line_is_answered(line):
     interpreter.run(line)
     interpreter.drone.step(0.01)
     assert np.isfinite(interpreter.drone.p_w).all()
+
+
+def test_state_without_mission_pads_is_the_older_form(hovering):
+    assert state_line(hovering, mission_pads=False).startswith("pitch:")
+    assert "mid" in parse_state(state_line(hovering))
+
+
+def test_nothing_is_heard_before_the_word_command():
+    interpreter = Interpreter(DroneModel())
+    assert interpreter.run("takeoff").when is Answer.NEVER
+    assert not interpreter.drone.flying
+
+
+def test_movements_on_the_ground_are_refused():
+    interpreter = Interpreter(DroneModel())
+    interpreter.run("command")
+    assert interpreter.run("up 50").text == "error Not joystick"

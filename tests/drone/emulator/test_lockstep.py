@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.drone.emulator.drone import Contact, DroneModel, Mode
-from edgeslam_torch.drone.emulator.lockstep import LockstepTello, Outage, Picture, Radio, State
+from edgeslam_torch.drone.emulator.lockstep import LockstepTello, Outage, Picture, Radio, Reply, State
 from edgeslam_torch.drone.sdk_state import parse_state
 
 
@@ -69,3 +69,20 @@ def test_hitting_a_wall_is_an_event_with_its_speed():
 def test_time_that_does_not_pass_is_refused(seconds):
     with pytest.raises(ValueError, match="step"):
         LockstepTello(DroneModel(), nothing).advance(seconds)
+
+
+def test_take_off_is_answered_when_it_is_over():
+    replies = [e for e in flown(8.0, commands=((0.0, "takeoff"),))[0] if isinstance(e, Reply)]
+    assert [r.text for r in replies] == ["ok"]
+    assert replies[0].arrived_s > 1.0
+
+
+def test_silence_lands_it():
+    _, drone = flown(25.0, commands=((0.0, "takeoff"),))
+    assert drone.mode is Mode.GROUND
+
+
+@pytest.mark.parametrize("wrong", [{"loss": 1.0}, {"video_s": -0.1}, {"video_hz": 0.0}])
+def test_impossible_radios_are_refused(wrong):
+    with pytest.raises(ValueError):
+        Radio(**wrong)

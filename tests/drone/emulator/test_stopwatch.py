@@ -23,3 +23,8 @@ def test_the_room_is_painted_where_the_drone_is(monkeypatch):
     drone.p_w = drone.p_w + [0.3, 0.0, 0.8]
     assert np.abs(paint(drone.T_w_b()).astype(float) - first).mean() > 3.0
     assert drone.clearance(drone.p_w) > 0.0
+
+
+def test_a_picture_without_a_stopwatch_shows_no_time(rng):
+    assert read_time(rng.integers(0, 256, (720, 960, 3), dtype=np.uint8)) is None
+    assert read_time(np.full((720, 960, 3), 90, np.uint8)) is None

@@ -108,3 +108,9 @@ def test_doubling_by_gather_copies_the_same_values():
     assert "scales" not in {tensor.name for tensor in model.graph.initializer}
     (y,) = onnxruntime.InferenceSession(model.SerializeToString()).run(["y"], {"x": x})
     np.testing.assert_array_equal(y, np.repeat(np.repeat(x + 1, 2, 2), 2, 3) + 1)
+
+
+def test_doubling_of_unknown_size_stays():
+    model = doubling([1, 3, "height", "width"])
+    double_by_gather(model)
+    assert [node.op_type for node in model.graph.node] == ["Add", "Resize", "Add"]

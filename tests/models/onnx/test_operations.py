@@ -2,6 +2,7 @@
 
 import numpy as np
 import onnx
+import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from edgeslam_torch.models.onnx.operations import Operations, count_operations
@@ -41,3 +42,8 @@ def test_weights_in_constant_nodes_count_alike():
     for name, tensor in moved.items():
         model.graph.node.insert(0, onnx.helper.make_node("Constant", [], [name], value=tensor))
     assert count_operations(model) == count_operations(network(False))
+
+
+def test_open_size_has_no_number():
+    with pytest.raises(ValueError, match="size of out is open"):
+        count_operations(network(False, "width"))

@@ -62,3 +62,7 @@ def test_the_imu_of_the_camera_is_chosen_and_said(counts, used, said):
     topics = [Topic(name, "sensor_msgs/Imu", count) for name, count in counts.items()]
     chosen, remark = choose_imu(topics, "/cam0/image")
     assert chosen == used and (remark is not None) == said
+
+
+def test_none_is_read_when_the_user_says_so(tmp_path):
+    assert opened(tmp_path, series("/imu"), topics=["imu=none"]).imu()[0] is None

@@ -1,6 +1,7 @@
 """Bags made to hang, to take memory or to run code; and formats that only look strange."""
 
 import bz2
+import os
 import shutil
 import sqlite3
 
@@ -226,3 +227,19 @@ def test_sizes_constants_and_names_of_messages_are_bounded_before_they_reach_the
     for each in types:
         with pytest.raises(SourceError, match="/x"):
             check_types(each, "/x")
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("name", ["b.db3", "b.mcap"])
+def test_a_pipe_in_a_bags_folder_is_refused(tmp_path, name):
+    bags.write_ros2(tmp_path / "bag", _pictures(0, 3))
+    os.mkfifo(tmp_path / "bag" / name)
+    with pytest.raises(SourceError, match="not a regular file"):
+        open_source(tmp_path / "bag")
+
+
+def test_mcap_of_ros1_that_was_not_closed_is_refused_with_the_remedy(tmp_path):
+    path = _mcap_of_ros1(tmp_path / "a.mcap", "ros1", 4)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(SourceError, match="mcap recover"):
+        list(open_source(path).frames())

@@ -95,3 +95,22 @@ def test_compressed_pictures_are_checked_as_files_are():
     ):
         with pytest.raises(SourceError, match=word):
             PictureDecoder("x").decode(SimpleNamespace(format="jpeg", data=np.frombuffer(data, np.uint8)))
+
+
+def test_the_first_picture_sets_the_range_of_all():
+    decoder = PictureDecoder("x")
+    bright, dark = (np.full((2, 2), value, "<u2").tobytes() for value in (65535, 255))
+    assert decoder.decode(_message("mono16", bright, 2, 2)).max() == 255
+    assert decoder.decode(_message("mono16", dark, 2, 2)).max() == 0
+
+
+@pytest.mark.parametrize(("encoding", "width", "height"), [("yuyv", 3, 3), ("uyvy", 1, 1), ("yuv422", 5, 1)])
+def test_sizes_that_an_encoding_cannot_have_are_refused_in_one_line(encoding, width, height):
+    with pytest.raises(SourceError, match=encoding):
+        _read(encoding, [128] * (2 * width * height), width, height)
+
+
+def test_a_row_of_four_gigabytes_in_one_line_costs_no_memory():
+    message = _message("mono8", [7] * 6, 6, 1)
+    message.step = 4_000_000_000
+    assert (PictureDecoder("x").decode(message) == 7).all()

@@ -5,7 +5,8 @@ import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.errors import SourceError
+from edgeslam_torch import cli
+from edgeslam_torch.errors import MissingPackageError, SourceError
 from edgeslam_torch.readers.source import open_source
 
 pytest.importorskip("rosbags")
@@ -140,3 +141,38 @@ def test_several_odometries_are_not_guessed_between(tmp_path):
     chosen = open_source(path, topics=["odom=/wheels"])
     assert chosen.telemetry[5].velocity_m_s == pytest.approx([1.0, 0.0, 0.0])
     assert open_source(path, topics=["odom=none"]).telemetry == []
+
+
+def test_a_picture_that_comes_late_is_left_out(tmp_path):
+    times = _times(6)
+    times[3], times[4] = times[4], times[3]
+    source = open_source(bags.write_mcap(tmp_path / "a.mcap", bags.pictures(times, received=_times(6))))
+    assert len(_stamps(source)) == 5 and "does not increase" in _reasons(source)
+
+
+def test_a_damaged_picture_costs_itself_only(tmp_path):
+    events = bags.pictures(_times(4))
+    events[2][3]["data"] = b"short"
+    source = open_source(bags.write_mcap(tmp_path / "a.mcap", events))
+    assert len(_stamps(source)) == 3 and "too few" in _reasons(source)
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch):
+    path = bags.write_mcap(tmp_path / "a.mcap", bags.pictures(_times(2)))
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag1", None)
+    with pytest.raises(MissingPackageError, match=r"pip install 'edgeslam-torch\[bags\]'"):
+        open_source(path)
+
+
+def test_topics_are_listed_with_what_they_are_used_as(tmp_path, capsys):
+    data = np.full((48, 64), 900, np.uint16)
+    depth = [("/depth/image", IMAGE, t, bags.picture(t, data, "16UC1")) for t in _times(2)]
+    odom = [("/odom", ODOM, t, bags.odometry(t, (0, 0, 0), 0.0, (1, 0, 0))) for t in _times(31)]
+    path = bags.write_mcap(tmp_path / "a.mcap", bags.in_order(bags.pictures(_times(31), late_s=0.0), depth, odom))
+    assert cli.main(["topics", str(path)]) == 0
+    lines = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines()[2:]}
+    assert lines["/cam/image_raw"][1:] == ["sensor_msgs/Image", "31", "30.0", "image"]
+    assert lines["/odom"][-1] == "odom"
+    assert "".join(lines["/depth/image"][4:]) == "notused(depthmap,16UC1)"
+    assert cli.main(["topics", str(tmp_path / "no.bag")]) == 1
+    assert "no such file" in capsys.readouterr().err

@@ -112,3 +112,21 @@ def test_the_tello_drivers_own_message_is_read_by_the_bags_definition(tmp_path):
         assert sample.rpy_rad[2] == pytest.approx(math.radians(30.0))
         assert (sample.tof_m, sample.height_m, sample.battery) == pytest.approx((1.2, 0.9, 0.8))
         assert sample.acceleration_m_s2[2] == pytest.approx(9.80665)
+
+
+def test_odometry_whose_child_is_its_world_is_not_turned(tmp_path):
+    _check(_read(tmp_path, _odometry(_world, "odom")).telemetry)
+
+
+def test_on_a_short_way_the_child_frame_decides(tmp_path):
+    short = _odometry(_world, "odom")[:4]
+    samples = _read(tmp_path, short).telemetry
+    assert samples[3].velocity_m_s == pytest.approx(_world(samples[3].stamp_s))
+
+
+def test_a_fast_topic_is_thinned(tmp_path):
+    fast = [BEGIN_S + 0.002 * i for i in range(2500)]
+    odometry = [("/odom", ODOM, t, bags.odometry(t, _position(t), _yaw(t), BODY)) for t in fast]
+    samples = _read(tmp_path, odometry).telemetry
+    assert 90 < len(samples) < 115
+    _check(samples)

@@ -74,3 +74,14 @@ def test_what_is_doubtful_is_said_in_one_line(tmp_path, columns, words):
 def test_what_is_no_imu_is_refused(tmp_path, columns, words):
     with pytest.raises(SourceError, match=words):
         read_readings(written(tmp_path / "imu.csv", "", *columns))
+
+
+def test_good_readings_cause_no_remark(tmp_path):
+    assert read_readings(written(tmp_path / "imu.csv", "", STAMPS_S, RATE, FORCE))[1] == []
+
+
+@pytest.mark.parametrize("text", ["", "1 2\n", "1 a b c d e f\n", "nan nan nan nan\n"])
+def test_text_that_is_no_table_of_readings_is_refused(tmp_path, text):
+    (tmp_path / "imu.csv").write_text(text)
+    with pytest.raises(SourceError, match=r"imu\.csv"):
+        read_readings(tmp_path / "imu.csv")

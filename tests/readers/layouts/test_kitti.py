@@ -43,3 +43,8 @@ def test_bad_files_are_named(sequence):
     (sequence / "times.txt").write_text("0.0\nlater\n")
     with pytest.raises(SourceError, match=r"times\.txt: line 2"):
         open_source(sequence)
+
+
+def test_image_without_a_stamp_is_left_out_by_name(sequence, write_images):
+    write_images(sequence / "image_2", ["000004.png", "cover.png"])
+    assert [p.reason for p in open_source(sequence).problems] == ["its name is not a line of times.txt"] * 2

@@ -8,7 +8,7 @@ import pytest
 
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.readers import layouts as package
-from edgeslam_torch.readers.layouts import layouts
+from edgeslam_torch.readers.layouts import layout_of, layouts
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.train.views.datasets import load_depth_folder
 
@@ -86,3 +86,23 @@ def test_stamps_of_a_layout_may_be_in_any_unit(tmp_path, write_images, kind, fac
     stamps = [frame.stamp_s for frame in source.frames()]
     assert source.kind == kind.split(",")[0]
     assert np.allclose(stamps, [1305031102.2 + i / 30 for i in range(12)], atol=2e-3)
+
+
+@pytest.mark.parametrize("layout", layouts(), ids=lambda layout: layout.KIND)
+def test_folder_of_something_else_is_not_recognised(layout, tmp_path):
+    (tmp_path / "notes.txt").write_text("")
+    assert not layout.recognises(tmp_path)
+    assert layout_of(tmp_path) is None
+
+
+@pytest.mark.parametrize("begin", [0, 328551511918592, 1403636579763555584])
+@pytest.mark.parametrize("prefix", ["", "frame_", "cam0-"])
+def test_names_may_be_nanoseconds(tmp_path, write_images, begin, prefix):
+    write_images(tmp_path, [f"{prefix}{begin + i * 33333333}.png" for i in range(12)])
+    source = open_source(tmp_path)
+    assert np.allclose(np.diff([frame.stamp_s for frame in source.frames()]), 1 / 30, rtol=1e-3)
+
+
+def test_an_assumed_rate_is_said(tmp_path, write_images):
+    write_images(tmp_path, [f"img_{i:06d}.png" for i in range(4)])
+    assert any("30 images/s" in problem.reason for problem in open_source(tmp_path).problems)
