@@ -16,13 +16,11 @@ from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.navigation.openings.wall_frame import Walls
 from edgeslam_torch.navigation.pilot import Phase, Pilot
 from edgeslam_torch.navigation.skills.skill import Result, Skill
+from edgeslam_torch.navigation.space import CELL_M
 from edgeslam_torch.navigation.supervisor import Order, Supervisor
 from edgeslam_torch.types import FloatArray
 
 logger = logging.getLogger(__name__)
-
-_STEP_M = 0.1
-"""Distance between points of the track."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +158,7 @@ class FlightController:
         here = state.p_w[:2]
         with self._lock:
             step = float(np.linalg.norm(here - self._track.last_w)) if len(self._track) else 0.0
-            if len(self._track) and step < _STEP_M:
+            if len(self._track) and step < CELL_M:
                 return
             self._track.add(self._supervisor.views, here)
             self._path_m += step

@@ -11,12 +11,12 @@ from edgeslam_torch.drone.tello import StateMessage
 from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.flying.perception.slam_perception import SlamPerception
 from edgeslam_torch.flying.recorder import Recorder
+from edgeslam_torch.flying.vehicle import TICK_S
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.navigation.drone_state import View
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import Frame
 
-TICK_S = 0.05
 IMAGE_SIZE = (480, 360)
 _ANSWER_S = 20.0
 

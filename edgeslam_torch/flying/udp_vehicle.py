@@ -14,19 +14,18 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.flying.perception.slam_perception import SlamPerception
 from edgeslam_torch.flying.recorder import Recorder
+from edgeslam_torch.flying.vehicle import TICK_S
 from edgeslam_torch.navigation.drone_state import View
 from edgeslam_torch.types import Frame
 
 logger = logging.getLogger(__name__)
 
-TICK_S = 0.05
 _VIDEO_DELAY_S = 0.35
 """Latency of a Tello's video from exposure to arrival (0.3 to 0.5 s); frames carry no time stamp."""
 _FIRST_PICTURE_S = 10.0
 _PICTURE_S = 1.0 / 15.0
 """Minimum interval of processed frames; a Tello sends 30 Hz. Two cores also run planner and mapping, and flights in
 lockstep are evaluated at 15 Hz."""
-_POLL_S = 0.02
 _LAND_S = 60.0
 """Maximum wait for a landing, with the client's repetitions and the descent."""
 _THINK_S = 0.5
@@ -114,7 +113,7 @@ class UdpVehicle:
     def fly(self, until: Callable[[], bool]) -> None:
         """As `Vehicle`."""
         while self.flying and not until():
-            self._stopping.wait(_POLL_S)
+            self._stopping.wait(TICK_S)
 
     def close(self) -> None:
         """As `Vehicle`."""

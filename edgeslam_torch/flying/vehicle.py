@@ -5,6 +5,9 @@ from typing import Protocol
 
 from edgeslam_torch.geometry.camera import Camera
 
+TICK_S = 0.05
+"""Control cycle."""
+
 
 class Vehicle(Protocol):
     """A drone with perception and flight controller."""

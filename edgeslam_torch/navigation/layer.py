@@ -41,6 +41,13 @@ class Layer:
             return np.full(self.solid.shape, np.inf)
         return np.maximum(distance_cells(~self.solid) - 0.5, 0.0) * self.cell_m
 
+    def part_around(self, open_: np.ndarray, p_w: FloatArray) -> np.ndarray:
+        """The connected parts of cells ``(X, Y)`` within two cells of a point ``(2,)``."""
+        parts, _ = ndimage.label(open_)
+        i, j = self.cells(p_w)
+        around = parts[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3]
+        return np.isin(parts, around[around > 0])
+
     def cells(self, p_w: FloatArray) -> np.ndarray:
         """Cells ``(..., 2)`` int of points ``(..., 2)``, clipped to the grid."""
         index = np.floor((np.asarray(p_w) - self.corner_w) / self.cell_m).astype(int)

@@ -12,10 +12,9 @@ from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.map_views import Places
+from edgeslam_torch.navigation.openings.exit_tracker import PLACES_M
 from edgeslam_torch.types import FloatArray
 
-SAME_PLACE_M = 0.5
-"""Distance within which views are from one place."""
 _RISE_M = 0.25
 """From here above the flight height a Tello's camera sees that height from 0.6 m on."""
 _HEADINGS = 24
@@ -72,7 +71,7 @@ class PathViews:
             return False
         if view is None:
             return True
-        if not self._place.is_near(here, SAME_PLACE_M):
+        if not self._place.is_near(here, PLACES_M):
             self._place, self._taken = Places(state.views, here), []
         for look in self._taken:
             unseen_w = unseen_w[~self._shows(look, unseen_w, here, view)]

@@ -8,15 +8,15 @@ import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.arcs import Arcs, candidates
-from edgeslam_torch.navigation.contact.losses import Losses
+from edgeslam_torch.navigation.contact import Losses
 from edgeslam_torch.navigation.drone_state import HOVER, Contact, DroneState, VelocityCommand, View
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.map_views import MapViews, Places
-from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
+from edgeslam_torch.navigation.openings.exit_tracker import PLACES_M, ExitTracker
 from edgeslam_torch.navigation.openings.wall_frame import Walls
-from edgeslam_torch.navigation.path_views import SAME_PLACE_M, PathViews
-from edgeslam_torch.navigation.route import CostToGo, cost_to_go
+from edgeslam_torch.navigation.path_views import PathViews
+from edgeslam_torch.navigation.route import TIGHT_M, CostToGo, cost_to_go
 from edgeslam_torch.navigation.skills.skill import NO_WAY, Result, Skill
 from edgeslam_torch.navigation.space import CELL_M, Space
 from edgeslam_torch.navigation.speed_dither import dithered
@@ -46,12 +46,8 @@ _MOVES_S = 1.0
 _LOST_S = 15.0
 """Time without progress, a full look around, after which obstacles are reset and observed anew; the next time the
 skill has no way."""
-_LOST_M = 1.5
-"""Distance within which tracking losses belong to one place."""
 _NARROW_AHEAD_M = 2.0
 """Distance ahead within which a too narrow gap is attributed to the last look."""
-_WANTED_M = 0.45
-"""Preferred clearance."""
 _UPRIGHT_M, _UPRIGHT_SHARE = (0.7, 1.5), 0.7
 """Heights visible on a wall two metres away, and the occupied share that makes a column a wall."""
 
@@ -80,8 +76,6 @@ class Pilot:
     exits: ExitTracker = field(default_factory=ExitTracker)
     """Exits found so far, whatever the skill."""
     _plan: CostToGo | None = None
-    _goals: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
-    """Goal cells ``(G, 2)`` of the plan."""
     _planned_s: float = -math.inf
     _progress_s: float = math.nan
     """Time of the last progress; time while overridden does not count."""
@@ -105,7 +99,7 @@ class Pilot:
     """Whether too narrow gaps are still inspected; false after one without success."""
     _doubted: Places = field(default_factory=Places)
     """Position at which obstacles were reset last."""
-    _losses: Losses = field(default_factory=lambda: Losses(_LOST_M))
+    _losses: Losses = field(default_factory=Losses)
     """Tracking losses since the skill began."""
     _submap: int = 0
     """Current submap."""
@@ -120,7 +114,7 @@ class Pilot:
         self.skill, self.result = skill, None
         self._plan, self._planned_s, self._tries_narrow, self._doubted = None, -math.inf, True, Places()
         self._progress_s, self._least, self._views.look = math.nan, math.inf, None
-        self._losses = Losses(_LOST_M)
+        self._losses = Losses()
 
     @property
     def phase(self) -> Phase:
@@ -240,7 +234,7 @@ class Pilot:
         now = float(plan.at(here))
         if math.isnan(self._least):
             self._least = now
-        if now < self._least - 0.1 or not self._progress.is_near(here, SAME_PLACE_M):
+        if now < self._least - 0.1 or not self._progress.is_near(here, PLACES_M):
             self._least, self._progress_s = min(now, self._least), state.stamp_s
             self._progress = Places(state.views, here)
         elif state.stamp_s - self._progress_s > _LOST_S:
@@ -287,19 +281,18 @@ class Pilot:
 
     def _planned(self, state: DroneState) -> CostToGo:
         """The plan, updated every `_REPLAN_S`."""
-        half = self.limits.radius_m + BAND_M
-        self.layer = self.space.layer(self.limits.height_m, half)
+        self.layer = self.space.layer(self.limits.height_m, self.limits.radius_m + BAND_M)
         if self._plan is None or state.stamp_s - self._planned_s >= _REPLAN_S:
-            self._goals = self.skill.goals(self.layer, state)
+            goals = self.skill.goals(self.layer, state)
             need, here = self.limits.clearance_m(state.position_sigma_m), self.layer.cells(state.p_w[:2])
             narrow = self._hull_m(state) if self._tries_narrow else math.inf
-            self._plan = cost_to_go(self.layer, self._goals, need, here, _BESIDE_M, narrow)
+            self._plan = cost_to_go(self.layer, goals, need, here, _BESIDE_M, narrow)
             self._planned_s = state.stamp_s
         return self._plan
 
     def _bearing(self, here: FloatArray) -> float:
         """Bearing of the path at `_AHEAD_M` ahead."""
-        far = self.way_w[min(len(self.way_w) - 1, round(_AHEAD_M / 0.1))] - here
+        far = self.way_w[min(len(self.way_w) - 1, round(_AHEAD_M / CELL_M))] - here
         return math.atan2(far[1], far[0])
 
     def _chosen(self, state: DroneState, plan: CostToGo, ahead: float, error: float) -> FloatArray | None:
@@ -313,9 +306,7 @@ class Pilot:
         good = arcs.clearance_m >= need
         if standing < need:  # already too close: allow moves that increase the clearance
             good |= arcs.clearance_m >= standing - 1e-3
-        if self._may_squeeze(state.p_w[:2]):
-            good |= self._squeezes(arcs, state)
-        good |= self._goes_back(arcs, state)
+        good |= self._passes_slowly(arcs, state)
         score = self._score(arcs, plan, state, error)
         score[~good] = np.inf
         best = int(np.argmin(score))
@@ -325,39 +316,33 @@ class Pilot:
 
     def _may_squeeze(self, here: FloatArray) -> bool:
         """Whether a look from here did not open the path, and unknown cells are not obstacles that were reset."""
-        return self._views.exhausted.is_near(here, SAME_PLACE_M) and not self._doubted.is_near(here, SAME_PLACE_M)
+        return self._views.exhausted.is_near(here, PLACES_M) and not self._doubted.is_near(here, PLACES_M)
 
-    def _squeezes(self, arcs: Arcs, state: DroneState) -> np.ndarray:
-        """``(C,)`` slow moves with full clearance to obstacles, but only hull distance to unknown cells.
+    def _passes_slowly(self, arcs: Arcs, state: DroneState) -> np.ndarray:
+        """``(C,)`` slow moves with full clearance to obstacles but only hull distance to unknown cells, where no look
+        shows more of them, and moves with hull distance to both along the path flown.
 
-        Cells within 0.6 m beside the drone lie outside the vertical field of view, so no look from here resolves them.
+        Cells within 0.6 m beside the drone lie outside the vertical field of view, and a door frame that was passed was
+        never seen from behind.
         """
         slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SLOW * self.limits.speed_m_s + 1e-6
-        hull = self._hull_m(state)
-        away = arcs.from_solid_m >= self.limits.clearance_m(state.position_sigma_m)
-        return np.asarray(slow & away & (arcs.clearance_m >= hull))
-
-    def _goes_back(self, arcs: Arcs, state: DroneState) -> np.ndarray:
-        """``(C,)`` slow moves along the path flown, as through a door whose frame was never seen from behind."""
-        slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SLOW * self.limits.speed_m_s + 1e-6
-        hull = self._hull_m(state)
-        passes = (arcs.from_solid_m >= hull + 0.5 * CELL_M) & (arcs.clearance_m >= hull)
-        return np.asarray(slow & passes & self.space.was_at(arcs.p_w).all(axis=1))
+        hull_m = self._hull_m(state)
+        beside = arcs.from_solid_m >= self.limits.clearance_m(state.position_sigma_m)
+        beside &= self._may_squeeze(state.p_w[:2])
+        back = (arcs.from_solid_m >= hull_m + 0.5 * CELL_M) & self.space.was_at(arcs.p_w).all(axis=1)
+        return np.asarray(slow & (arcs.clearance_m >= hull_m) & (beside | back))
 
     def _hull_m(self, state: DroneState) -> float:
         """Hull radius plus two standard deviations of the position [m]."""
         return self.limits.radius_m + 2.0 * state.position_sigma_m
 
     def _score(self, arcs: Arcs, plan: CostToGo, state: DroneState, error: float) -> FloatArray:
-        """Cost to go after each candidate plus a penalty for low clearance."""
-        score = np.asarray(plan.at(arcs.end_w), dtype=np.float64).copy()
+        """Cost to go after each candidate plus a penalty for low clearance; infinite for fast ones outside the view."""
         away = arcs.from_solid_m if self._may_squeeze(state.p_w[:2]) else arcs.clearance_m
-        score += 0.5 * np.clip(_WANTED_M - away, 0.0, None)
-        speed = np.linalg.norm(arcs.velocity_w, axis=1)
+        score = np.asarray(plan.at(arcs.end_w)) + 0.5 * np.clip(TIGHT_M - away, 0.0, None)
+        fast = np.linalg.norm(arcs.velocity_w, axis=1) > _SIDEWAYS * self.limits.speed_m_s + 1e-6
         off = np.abs(wrapped(np.arctan2(arcs.velocity_w[:, 1], arcs.velocity_w[:, 0]) - state.yaw_rad))
-        unseen = (off > _FACING_RAD) & (speed > _SIDEWAYS * self.limits.speed_m_s + 1e-6)
-        turning = (abs(error) > _FACING_RAD) & (speed > _SIDEWAYS * self.limits.speed_m_s + 1e-6)
-        score[unseen | turning] = np.inf
+        score[fast & ((off > _FACING_RAD) | (abs(error) > _FACING_RAD))] = np.inf
         return score
 
     def _start_over(self, state: DroneState) -> None:
@@ -365,7 +350,7 @@ class Pilot:
 
         Reset cells are freed by two views instead of up to ten, so they are not passed at hull distance.
         """
-        if self._doubted.is_near(state.p_w[:2], SAME_PLACE_M) or not state.tracked:
+        if self._doubted.is_near(state.p_w[:2], PLACES_M) or not state.tracked:
             self.result = NO_WAY
             return
         self.space.doubt_solids()

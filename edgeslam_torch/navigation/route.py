@@ -17,7 +17,7 @@ _UNSEEN_COST = 2.5
 _NARROW_COST = 10.0
 """Cost per metre of a gap narrower than the required clearance. Gaps look narrower from afar, so a closer look pays off
 before a detour of this many metres."""
-_TIGHT_M, _TIGHT_COST = 0.45, 2.0
+TIGHT_M, _TIGHT_COST = 0.45, 2.0
 """Distance to obstacles below which a metre costs up to this much more, so that paths keep to the middle."""
 
 
@@ -72,7 +72,7 @@ def cost_to_go(
     open_ = away > min(clearance_m, narrow_m) - slack
     low = np.maximum(here - 2, 0)
     open_[low[0] : here[0] + 3, low[1] : here[1] + 3] |= ~layer.solid[low[0] : here[0] + 3, low[1] : here[1] + 3]
-    tight = np.clip(1.0 - (away - clearance_m) / _TIGHT_M, 0.0, 1.0)
+    tight = np.clip(1.0 - (away - clearance_m) / TIGHT_M, 0.0, 1.0)
     weight = np.where(layer.free, 1.0, _UNSEEN_COST) + _TIGHT_COST * tight
     weight += np.where(away > clearance_m - slack, 0.0, _NARROW_COST)
     shape = layer.free.shape

@@ -10,7 +10,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from edgeslam_torch.navigation.contact.push import PUSHED_M_S, Push
+from edgeslam_torch.navigation.contact import PUSHED_M_S, Push
 from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.map_views import MapViews, Places

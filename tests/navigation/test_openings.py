@@ -11,9 +11,8 @@ from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.navigation.exploring.frontiers import Looks, reachable
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import MapUpdate, MapViews
-from edgeslam_torch.navigation.openings.detour import has_detour
 from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
-from edgeslam_torch.navigation.openings.exits import openings
+from edgeslam_torch.navigation.openings.exits import has_detour, openings
 from edgeslam_torch.navigation.openings.pathways import pathways
 from edgeslam_torch.navigation.openings.wall_frame import Walls, along_walls, wall_directions
 from edgeslam_torch.navigation.pilot import Pilot

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.navigation.contact.push import Push
+from edgeslam_torch.navigation.contact import Push
 from edgeslam_torch.navigation.drone_state import DroneState
 
 AHEAD = np.array([1.0, 0.0])

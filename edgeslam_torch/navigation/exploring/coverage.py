@@ -50,10 +50,8 @@ class Borders:
 
 def borders(layer: Layer, here_w: FloatArray) -> Borders:
     """Borders of the connected free space around a point ``(2,)``."""
-    parts, _ = ndimage.label(layer.clearance_m >= _BODY_M)
-    i, j = layer.cells(here_w)
-    around = parts[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3]
-    mine = ndimage.binary_dilation(np.isin(parts, around[around > 0]), iterations=2) & layer.free
+    wide = layer.clearance_m >= _BODY_M
+    mine = ndimage.binary_dilation(layer.part_around(wide, here_w), iterations=2) & layer.free
     closed, count = ndimage.label(~layer.free)
     sizes = np.bincount(closed.ravel(), minlength=count + 1) * layer.cell_m**2
     sizes[0] = 0.0
@@ -87,8 +85,6 @@ class Coverage:
 
     def unlooked(self, all_: Borders) -> Borders:
         """Borders that no view has covered."""
-        if not len(self._places) or not len(all_.p_w):
-            return all_
         places_w = self._places.p_w
         step = all_.p_w - places_w[:, None]
         bearing = np.arctan2(step[..., 1], step[..., 0]) - self._headings[:, None]

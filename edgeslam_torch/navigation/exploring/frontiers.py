@@ -8,10 +8,11 @@ from scipy import ndimage
 
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.types import FloatArray
 
-PASSED_M = 0.25
+PASSED_M = NavLimits().clearance_m(0.0)
 """Distance from obstacles at which the drone passes; what is closer to one is unreachable."""
 _FRONTIER_M = 0.3
 """Minimum frontier length; shorter ones are gaps between rays. A doorway of 0.85 m leaves this much."""
@@ -42,10 +43,8 @@ def frontiers(layer: Layer, least_m: float = _FRONTIER_M) -> np.ndarray:
 
 def reachable(cells: np.ndarray, layer: Layer, here_w: FloatArray) -> np.ndarray:
     """Cells ``(G, 2)`` connected to a point ``(2,)`` through space without obstacles."""
-    parts, _ = ndimage.label(layer.from_solid_m > PASSED_M - 0.5 * layer.cell_m)
-    i, j = layer.cells(here_w)
-    around = parts[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3]
-    return cells[np.isin(parts[cells[:, 0], cells[:, 1]], around[around > 0])]
+    passable = layer.part_around(layer.from_solid_m > PASSED_M - 0.5 * layer.cell_m, here_w)
+    return np.asarray(cells[passable[tuple(cells.T)]])
 
 
 @dataclass(slots=True)

@@ -9,8 +9,7 @@ from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.depth_rays import DepthRays
-from edgeslam_torch.navigation.openings.detour import has_detour
-from edgeslam_torch.navigation.openings.exits import SAME_M, WIDEST_M, Gap, openings
+from edgeslam_torch.navigation.openings.exits import SAME_M, WIDEST_M, Gap, has_detour, openings
 from edgeslam_torch.navigation.openings.wall_frame import CELL_SIGMAS, Walls, along_walls
 from edgeslam_torch.navigation.supervisor import DEAD_RECKONING_SIGMA_M
 from edgeslam_torch.types import FloatArray
@@ -20,7 +19,7 @@ SAME_COS = math.cos(math.radians(35.0))
 """Maximum angle between directions that belong to the same opening or wall."""
 _PASSAGE_M = 1.0
 """Minimum distance between two doors along a passage."""
-PLACES_M = 0.5
+PLACES_M = SAME_M
 """Minimum distance between distinct viewpoints."""
 FIELD_RAD = math.radians(20.0)
 """Half the field of view less a margin; an opening inside it that is not detected counts as missed."""

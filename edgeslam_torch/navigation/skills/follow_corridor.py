@@ -22,7 +22,7 @@ from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.exit_tracker import SAME_COS, Candidate, Exit
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
-from edgeslam_torch.navigation.skills.skill import Result, Skill
+from edgeslam_torch.navigation.skills.skill import FEW_LOSSES, Result, Skill
 from edgeslam_torch.types import FloatArray
 
 _TURN_COST_M = 6.0
@@ -38,8 +38,6 @@ _STANDS_S = 1.0
 _HOLDS_S = 2.0
 """Time for which a room, or an end without a view that is left, must hold: views arrive half a second late, and two
 free a cell."""
-_MOST_LOSSES = 3
-"""Tracking losses before a bare wall at a corridor's end after which it is not viewed any more."""
 
 
 @dataclass(slots=True)
@@ -98,7 +96,7 @@ class FollowCorridor(Skill):
     def result(self, state: DroneState, losses: int = 0) -> Result | None:
         """The corridor ended, or the drone has not flown a metre of one."""
         viewed = state.stamp_s - self._viewed_s > _HOLDS_S
-        ends = viewed or losses >= _MOST_LOSSES if len(self._end) else self._looks.over(state.stamp_s)
+        ends = viewed or losses >= FEW_LOSSES if len(self._end) else self._looks.over(state.stamp_s)
         room = state.stamp_s - self._wide_s > _HOLDS_S
         result = super(FollowCorridor, self).result(state, losses)
         if not (room or ends or result is not None):

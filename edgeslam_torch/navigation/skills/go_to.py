@@ -7,7 +7,7 @@ import numpy as np
 
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.skills.skill import Result, Skill
+from edgeslam_torch.navigation.skills.skill import FEW_LOSSES, Result, Skill
 from edgeslam_torch.navigation.supervisor import DEAD_RECKONING_SIGMA_M
 from edgeslam_torch.types import FloatArray
 
@@ -15,9 +15,9 @@ ARRIVED_M = 0.15
 SLOW_M_S = 0.15
 _MOST_DOUBT_M = 0.3
 """Upper bound of the position uncertainty that counts as arrived."""
-_NEAREST_M, _TRIES = 0.5, 3
-"""Distance from the goal that counts as arrived after tracking was lost near it this often: dead reckoning by truncated
-velocities brings the drone no closer."""
+_NEAREST_M = 0.5
+"""Distance from the goal that counts as arrived after tracking was lost near it `FEW_LOSSES` times: dead reckoning by
+truncated velocities brings the drone no closer."""
 
 
 @dataclass(slots=True)
@@ -47,7 +47,7 @@ class GoTo(Skill):
         away_m = float(np.linalg.norm(state.p_w[:2] - self.goal_w[:2]))
         carried_out = not state.tracked and state.position_sigma_m >= DEAD_RECKONING_SIGMA_M
         reach_m = max(ARRIVED_M, min(_doubt_m(state), _MOST_DOUBT_M)) if carried_out else ARRIVED_M
-        reach_m = _NEAREST_M if losses >= _TRIES else reach_m
+        reach_m = _NEAREST_M if losses >= FEW_LOSSES else reach_m
         if away_m >= reach_m or float(np.linalg.norm(state.velocity_w)) >= SLOW_M_S:
             return super(GoTo, self).result(state, losses)
         near = away_m <= ARRIVED_M

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from edgeslam_torch.navigation.contact import LOST_M
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
@@ -14,9 +15,8 @@ from edgeslam_torch.types import FloatArray
 
 _LOOK_M, _LOOK_S = 0.6, 3.0
 """Distance from the take-off at which the drone takes its initial heading, and duration of the look: enough for two
-keyframes, a loop closure and a view at the new scale."""
-_LOST_M = 1.5
-"""The same after a tracking loss this close, as by a bare wall behind the take-off."""
+keyframes, a loop closure and a view at the new scale. `LOST_M` is the distance after a tracking loss this close, as by
+a bare wall behind the take-off."""
 _AHEAD_RAD = math.radians(8.0)
 _GIVEN_UP_S = 12.0
 """Timeout of turn and look, half a turn at a third of the nominal rate plus the look; and time in which the drone flies
@@ -63,8 +63,8 @@ class ReturnHome(Skill):
     def look_rad(self, state: DroneState) -> float | None:
         """The heading of the take-off, 0, for `_LOOK_S` near the take-off."""
         away = float(np.linalg.norm(state.p_w[:2]))
-        if not state.tracked and away < _LOST_M:
-            self._look_m = _LOST_M
+        if not state.tracked and away < LOST_M:
+            self._look_m = LOST_M
         if state.stamp_s >= self._looked_s or away > self._look_m:
             return None
         if math.isnan(self._near_s):

@@ -14,8 +14,9 @@ from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
 
-MOST_LOSSES = 5
-"""Tracking losses at one place that end a skill: a view of a textureless surface fails repeatedly."""
+MOST_LOSSES, FEW_LOSSES = 5, 3
+"""Tracking losses at one place that end a skill: a view of a textureless surface fails repeatedly; and that end it at
+its goal."""
 
 
 @dataclass(frozen=True, slots=True)

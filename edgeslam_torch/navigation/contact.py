@@ -1,4 +1,4 @@
-"""Contact detection: the drone is commanded to move for a while and does not."""
+"""Obstruction of the flight: contact with unseen obstacles, and places of repeated tracking loss."""
 
 import math
 from dataclasses import dataclass, field
@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edgeslam_torch.navigation.drone_state import DroneState
+from edgeslam_torch.navigation.map_views import Places
+from edgeslam_torch.navigation.speed_dither import STEP_M_S
 from edgeslam_torch.types import FloatArray
 
 PUSHED_M_S = 0.15
@@ -13,8 +15,8 @@ PUSHED_M_S = 0.15
 _STANDS_M_S, _PUSH_S = 0.04, 1.5
 _PAUSE_S = 0.5
 """Gap between calls after which the detection restarts: other commands were sent meanwhile."""
-_REPORTED_STEP_M_S = 0.1
-"""Quantisation step of a Tello's reported velocity: lower speeds read 0."""
+LOST_M = 1.5
+"""Distance within which tracking losses belong to one place."""
 
 
 @dataclass(slots=True)
@@ -43,7 +45,7 @@ class Push:
         """
         turned = towards_w is not None and float(towards_w @ self._towards_w) < 0.0
         speed = float(np.linalg.norm(state.velocity_w[:2]))
-        stands = state.reported_speed_m_s < _REPORTED_STEP_M_S  # false for NaN
+        stands = state.reported_speed_m_s < STEP_M_S  # false for NaN
         if towards_w is None or turned or (speed > _STANDS_M_S and not stands):
             self._since_s, self._towards_w = math.nan, np.zeros(2) if towards_w is None else towards_w
             return False
@@ -58,3 +60,26 @@ class Push:
             self._since_s = math.nan
             return False
         return pushed_s > _PUSH_S
+
+
+@dataclass(slots=True)
+class Losses:
+    """Counts tracking losses that made the supervisor intervene, for one place at a time: a textureless view fails
+    repeatedly."""
+
+    count: int = 0
+    """Losses at the current place."""
+    _place: Places = field(default_factory=Places)
+    """Position of the first loss."""
+    _lost: bool = False
+
+    def note(self, state: DroneState) -> None:
+        """Process a state."""
+        if state.tracked:
+            self._lost = False
+        elif state.overridden and not self._lost:
+            self._lost = True
+            here = state.p_w[:2]
+            if float(self._place.away_m(here)) > LOST_M:
+                self._place, self.count = Places(state.views, [here]), 0
+            self.count += 1

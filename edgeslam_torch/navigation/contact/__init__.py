@@ -1,1 +1,0 @@
-"""Obstruction of the flight: contact with unseen obstacles, and places of repeated tracking loss."""
