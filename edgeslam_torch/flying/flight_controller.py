@@ -110,7 +110,9 @@ class FlightController:
             self._supervisor.propose(command, state.stamp_s)
         decision = Decision(command, str(self.pilot.phase))
         self._witness(decision)
-        self._note_clearance(state)
+        away_m = hull_clearance_m(self.pilot, state)
+        with self._lock:
+            self._clearance_m = float(np.fmin(self._clearance_m, away_m))
         return decision
 
     def order(self, state: DroneState) -> Order:
@@ -163,11 +165,11 @@ class FlightController:
             self._track.add(self._supervisor.views, here)
             self._path_m += step
 
-    def _note_clearance(self, state: DroneState) -> None:
-        layer = self.pilot.layer
-        if layer is None or not layer.solid.any():
-            return
-        i, j = layer.cells(state.p_w[:2])
-        away = float(layer.from_solid_m[i, j]) - self.limits.radius_m
-        with self._lock:
-            self._clearance_m = away if math.isnan(self._clearance_m) else min(self._clearance_m, away)
+
+def hull_clearance_m(pilot: Pilot, state: DroneState) -> float:
+    """Distance [m] between the hull and the nearest mapped obstacle; NaN without one."""
+    layer = pilot.layer  # another thread may replace it
+    if layer is None or not layer.solid.any():
+        return math.nan
+    i, j = layer.cells(state.p_w[:2])
+    return float(layer.from_solid_m[i, j]) - pilot.limits.radius_m

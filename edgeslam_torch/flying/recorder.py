@@ -1,7 +1,6 @@
 """Recording of a flight: frames and state like any recording, plus states and decisions."""
 
 import logging
-import math
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +9,7 @@ from edgeslam_torch.drone.tello import StateMessage
 from edgeslam_torch.errors import EdgeSlamError, OutputError
 from edgeslam_torch.files.appender import Appender
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.flying.flight_controller import Moment
+from edgeslam_torch.flying.flight_controller import Moment, hull_clearance_m
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.navigation.drone_state import Contact, DroneState
 from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewSkill, PlanLog
@@ -116,15 +115,6 @@ class Recorder:
             logger.warning("%s; the flight goes on", self.failure)
 
 
-def _clearance_m(moment: Moment) -> float:
-    """Distance between hull and nearest mapped obstacle [m]; NaN without one."""
-    layer = moment.pilot.layer
-    if layer is None or not layer.solid.any():
-        return math.nan
-    i, j = layer.cells(moment.state.p_w[:2])
-    return float(layer.from_solid_m[i, j]) - moment.pilot.limits.radius_m
-
-
 def _exit_line(exit_: Exit) -> str:
     sigmas = (exit_.width_m, exit_.width_sigma_m, exit_.position_sigma_m)
     numbers = (*exit_.centre_w[:2], *exit_.normal_w[:2], *sigmas)
@@ -144,7 +134,7 @@ def _line(moment: Moment) -> str:
         f"{state.blind_s:.3f}",
         f"{state.battery:.2f}",
         str(state.revision),
-        f"{_clearance_m(moment):.3f}",
+        f"{hull_clearance_m(moment.pilot, state):.3f}",
         str(moment.phase),
         str(order.danger),
         *(f"{x:.3f}" for x in stick),
