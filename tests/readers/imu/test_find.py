@@ -145,3 +145,14 @@ def test_without_an_imu_there_is_no_warning(tmp_path):
     assert found(tmp_path) == (None, None, [])
     with pytest.raises(EdgeSlamError, match="readings"):
         found(tmp_path, Given(model=tmp_path / "imu.yaml"))
+
+
+def test_given_files_come_before_those_of_the_folder(tmp_path):
+    (tmp_path / "imu.csv").write_text(HEADER + ROWS)
+    (tmp_path / "imu.yaml").write_text(OURS)
+    (tmp_path / "other.csv").write_text(HEADER + ROWS[: len(ROWS) // 2].rpartition("\n")[0] + "\n")
+    (tmp_path / "other.yaml").write_text(text_of(time_offset_s=0.01))
+    given = Given(tmp_path / "other.csv", tmp_path / "other.yaml")
+    model, readings, said = found(tmp_path, given)
+    assert len(readings) < 250 and model.time_offset_s == 0.01 and model.T_imu_cam is None
+    assert any("missing for 1.0 s" in line for line in said)

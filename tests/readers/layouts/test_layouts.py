@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.readers import layouts as package
 from edgeslam_torch.readers.layouts import layout_of, layouts
@@ -106,3 +107,11 @@ def test_names_may_be_nanoseconds(tmp_path, write_images, begin, prefix):
 def test_an_assumed_rate_is_said(tmp_path, write_images):
     write_images(tmp_path, [f"img_{i:06d}.png" for i in range(4)])
     assert any("30 images/s" in problem.reason for problem in open_source(tmp_path).problems)
+
+
+@pytest.mark.parametrize("rows", [["0.1"], ["a 0.1", "b 0.2"]])
+def test_times_that_do_not_fit_the_images_are_refused(tmp_path, write_images, rows):
+    write_images(tmp_path / "images", [f"{i}.png" for i in range(4)])
+    (tmp_path / "times.txt").write_text("\n".join(rows))
+    with pytest.raises(SourceError, match="times.txt"):
+        open_source(tmp_path)
