@@ -48,9 +48,11 @@ test: $(STAMP) kernels
 	$(PYTEST) --doctest-modules --doctest-ignore-import-errors tests edgeslam_torch $(PYTEST_ARGS)
 
 # What measures time, or must keep up with a flying drone, has the machine to itself. 5: nothing was selected.
+# Only files that say so are loaded: that of all takes ten seconds a process.
+MARKED := grep -rl --include='test_*.py' mark
 test-slow: $(STAMP)
-	$(PYTEST) -m "slow and not alone" $(PYTEST_ARGS) || test $$? = 5
-	$(PYTEST) -n 0 -m "slow and alone" $(PYTEST_ARGS) || test $$? = 5
+	$(PYTEST) -m "slow and not alone" $$($(MARKED).slow tests) $(PYTEST_ARGS) || test $$? = 5
+	$(PYTEST) -n 0 -m "slow and alone" $$($(MARKED).alone tests) $(PYTEST_ARGS) || test $$? = 5
 
 # mutmut changes the code in one place at a time and runs the tests that come by: what none of them notices is listed with
 # its change. By default every tenth change of ten files, against the fast suite; another tenth and other files each week.

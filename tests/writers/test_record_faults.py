@@ -14,6 +14,7 @@ import pytest
 from emulated import PATIENCE_S, emulated, on_the_floor, until
 
 from edgeslam_torch.cli import main
+from edgeslam_torch.drone import tello
 from edgeslam_torch.drone.emulator.drone import Mode
 from edgeslam_torch.readers.source import open_source
 
@@ -82,8 +83,9 @@ def test_an_outage_of_three_seconds(tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_a_drone_that_stops_answering(tmp_path, capsys):
+def test_a_drone_that_stops_answering(tmp_path, capsys, monkeypatch):
     """The only flight here that fails: the drone receives nothing any more and lands by itself."""
+    monkeypatch.setattr(tello, "_LAND_AGAIN_S", 0.5)
     with emulated() as (emulator, url):
 
         def freeze(stop):
