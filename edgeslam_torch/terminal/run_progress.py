@@ -1,6 +1,7 @@
 """Progress of a run: loading, frames with pose and way, last refinement, writing."""
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -62,7 +63,9 @@ class RunProgress(Progress):
         assert output is not None
         silent_s = getattr(source, "silent_s", 0.0)
         waits = f"no picture for {silent_s:.0f} s" if silent_s >= 1.0 else ""
-        height = height_text(source.telemetry[-1]) if source is not None and source.telemetry else ""
+        telemetry = [] if source is None else source.telemetry
+        before = bisect_right(telemetry, output.stamp_s, key=lambda sample: sample.stamp_s)
+        height = height_text(telemetry[before - 1]) if before else ""
         return ", ".join(part for part in (waits, status_words(output), height, self._path.text(output)) if part)
 
 

@@ -6,6 +6,7 @@ import os
 import pty
 import struct
 import termios
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from edgeslam_torch.terminal import progress as module
 from edgeslam_torch.terminal.console import Console
 from edgeslam_torch.terminal.progress import Progress
 from edgeslam_torch.terminal.run_progress import RunProgress
-from edgeslam_torch.types import Frame
+from edgeslam_torch.types import Frame, TelemetrySample
 
 
 @pytest.fixture(autouse=True)
@@ -111,3 +112,17 @@ def test_a_run_shows_frames_pose_distance_and_the_last_refinement():
         assert "tracked, 80 inliers" in said and "at (" in said and "travelled" in said
         progress.on_last_frame(slam)
         assert progress.text() == "last refinement"
+
+
+def test_the_height_is_that_of_the_frame_not_of_the_end_of_the_recording():
+    slam, image = FakeSlam(), np.full((4, 4), 9, np.uint8)
+    source = SimpleNamespace(
+        length=3, telemetry=[TelemetrySample(t, tof_m=h) for t, h in ((0, 0.1), (1, 0.8), (2, 1.5))]
+    )
+    with RunProgress("opening") as progress:
+        progress.follow(source)
+        for stamp, height in ((-0.5, None), (0.9, "0.10"), (1.0, "0.80"), (7.0, "1.50")):
+            frame = Frame(0, stamp, image)
+            progress.on_frame(frame, slam.step(frame), slam)
+            said = progress.text()
+            assert "height" not in said if height is None else f"height {height} m" in said
