@@ -42,7 +42,7 @@ def _short(value: Any) -> str:
     if isinstance(value, StrEnum):
         return str(value)
     if isinstance(value, float):
-        return f"{value:.10g}"
+        return f"{value:.16g}"
     if isinstance(value, (list, tuple, dict)) and len(value) > _SHOWN:
         return f"{type(value).__name__} of {len(value)}"
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
@@ -150,7 +150,7 @@ def check_frame(frame: Frame) -> None:
         raise TypeError(
             f"{frame.name}: an image is a numpy array of uint8, (H, W, 3) BGR or (H, W), got {got}; {remedy}"
         )
-    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3) or not image.size:
         raise ValueError(f"{frame.name}: an image is (H, W, 3) BGR or (H, W), got {image.shape}; {remedy}")
     if not math.isfinite(frame.stamp_s):
         raise ValueError(f"{frame.name}: the stamp must be a finite number of seconds, got {frame.stamp_s}")

@@ -51,6 +51,7 @@ def test_what_is_no_rgb_image_is_refused(image):
         Frame(0, 0.0, torch.from_numpy(RGB)),
         Frame(0, 0.0, RGB.transpose(2, 0, 1)),
         Frame(0, 0.0, None),
+        Frame(0, 0.0, RGB[:0]),
         Frame(0, float("nan"), RGB),
     ],
 )

@@ -141,6 +141,8 @@ def main(args: argparse.Namespace) -> int:
         _say(_camera_words(source.camera))
         mode = Mode(args.mode) if args.mode else (Mode.REALTIME if source.live else Mode.OFFLINE)
         out = args.out if args.out is not None else _new_folder(Path("runs") / source.name)
+        if (out / "summary.json").exists():
+            _say(f"replaces the earlier run in {out}")
         progress.follow(source)
         listeners: list[Listener] = [progress]
         saved = None

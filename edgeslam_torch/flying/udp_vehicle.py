@@ -3,7 +3,7 @@
 import logging
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from edgeslam_torch.calibration.camera_choice import choose_camera
@@ -26,10 +26,28 @@ _FIRST_PICTURE_S = 10.0
 _PICTURE_S = 1.0 / 15.0
 """Minimum interval of processed frames; a Tello sends 30 Hz. Two cores also run planner and mapping, and flights in
 lockstep are evaluated at 15 Hz."""
+_SLOW_S, _SLOW_HZ = 10.0, 5.0
+"""Mean rate of processed frames over this time in flight below which a warning is due: at 0.5 m/s and by turns of 30
+degrees a second, frames are then 0.1 m and 6 degrees apart, as far as tracking is tested."""
 _LAND_S = 60.0
 """Maximum wait for a landing, with the client's repetitions and the descent."""
 _THINK_S = 0.5
 """Timeout for a thread to end."""
+
+
+def too_slow(seen_s: Sequence[float]) -> str:
+    """A warning if too few frames were processed; nothing before `_SLOW_S` have passed.
+
+    Args:
+        seen_s: Times at which frames in flight were processed [s].
+    """
+    spent_s = seen_s[-1] - seen_s[0]
+    if spent_s < _SLOW_S or len(seen_s) - 1 >= _SLOW_HZ * spent_s:
+        return ""
+    return (
+        f"this computer processes {(len(seen_s) - 1) / spent_s:.1f} pictures a second; below {_SLOW_HZ:g} the map "
+        "suffers: close other programs, or see the guide on small computers"
+    )
 
 
 class UdpVehicle:
@@ -139,6 +157,7 @@ class UdpVehicle:
         """Perception thread: process the newest frame."""
         assert self._perception is not None
         count = 0
+        flown_s: list[float] = []
         while not self._stopping.is_set():
             picture = self._video.wait(count, TICK_S)
             if picture is None:
@@ -154,6 +173,10 @@ class UdpVehicle:
             if view is not None:
                 with self._view_lock:
                     self._view = view
+            if self.flying and (not flown_s or flown_s[-1] - flown_s[0] < _SLOW_S):
+                flown_s.append(self.tello.clock.now())
+                if warning := too_slow(flown_s):
+                    logger.warning(warning)
             if self._recorder is not None:
                 self._recorder.picture(Frame(picture.count - 1, picture.stamp_s, picture.image))
             self._stopping.wait(max(0.0, begin_s + _PICTURE_S - self.tello.clock.now()))

@@ -195,3 +195,25 @@ def test_an_unknown_camera_does_not_fly(monkeypatch):
         pytest.raises(FlightRefused, match="calibration"),
     ):
         nav.take_off()
+
+
+@pytest.mark.parametrize(
+    ("hz", "seconds", "warns"), [(15, 30, False), (6, 30, False), (3, 30, True), (0.2, 30, True), (3, 9, False)]
+)
+def test_a_computer_too_slow_for_the_flight_is_named_with_its_rate(hz, seconds, warns):
+    said = udp_vehicle.too_slow(np.arange(0, seconds, 1 / hz).tolist())
+    assert (f" {hz:.1f} pictures" in said) == warns == bool(said)
+
+
+def test_it_is_said_once_in_flight(flight, monkeypatch, caplog):
+    _, vehicle, _ = flight
+    monkeypatch.setattr(udp_vehicle, "_SLOW_S", 0.5)
+    monkeypatch.setattr(udp_vehicle, "_SLOW_HZ", 1000.0)
+    before = len(vehicle._perception.seen_s)
+    until(lambda: len(vehicle._perception.seen_s) > before + 10)
+    assert not caplog.records, "on the ground"
+    vehicle.take_off()
+    until(lambda: caplog.records)
+    before = len(vehicle._perception.seen_s)
+    until(lambda: len(vehicle._perception.seen_s) > before + 20)
+    assert len(caplog.records) == 1
