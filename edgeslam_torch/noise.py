@@ -69,6 +69,9 @@ IMU_BIAS_SIGMA = np.repeat([0.1, 0.3], 3)
 IMU_SCALE_LOG = 0.01
 """Error of the scale by the accelerometer's gain and axes, which averaging does not reduce: a percent beside the laser
 tracker of a real flight; data sheets allow 3 % (MPU-6050)."""
+IMU_AXES_RAD = 0.01
+"""Error of gravity's direction by the accelerometer's axes, likewise: 0.4 degrees on that flight; data sheets allow
+axes that are 0.3 (ADIS16448) to 1 degree (MPU-6050) from square."""
 KNOWN_MOUNT_RAD, KNOWN_LEVER_M, KNOWN_OFFSET_S = 1e-3, 2e-3, 2e-4
 """Of calibrated values."""
 UNKNOWN_MOUNT_RAD, UNKNOWN_LEVER_M, UNKNOWN_OFFSET_S = 0.1, 0.1, 0.02

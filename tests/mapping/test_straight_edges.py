@@ -10,11 +10,17 @@ LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """``R_w_c`` of a level camera that looks along x."""
 
 
-def cameras(count=24, pan_deg=60.0, pitch_deg=-20.0, roll_deg=0.0):
-    """Rotations of a camera that pans about the vertical."""
+DEPTH = 2.0
+
+
+def cameras(count=24, pan_deg=60.0, pitch_deg=-20.0, roll_deg=0.0, moved=2.0):
+    """Poses of a camera that pans about the vertical, and moves sideways."""
     held = Rotation.from_euler("ZX", [roll_deg, pitch_deg], degrees=True).as_matrix()
     pans = Rotation.from_euler("z", np.linspace(0.0, pan_deg, count)[:, None], degrees=True).as_matrix()
-    return pans @ LEVEL @ held
+    T_w_c = np.tile(np.eye(4), (count, 1, 1))
+    T_w_c[:, :3, :3] = pans @ LEVEL @ held
+    T_w_c[:, 1, 3] = np.linspace(0.0, moved, count)
+    return T_w_c
 
 
 def room(rng, count=24, per_keyframe=20, verticals=0.3, clutter=0.2, noise_rad=0.01):
@@ -43,26 +49,35 @@ def turned(segments, R):
 @pytest.mark.parametrize("pitch_deg, roll_deg", [(0.0, 0.0), (-40.0, 0.0), (-30.0, 25.0), (15.0, -25.0)])
 @pytest.mark.parametrize("verticals", [0.0, 0.3])
 def test_a_room_gives_the_vertical_of_a_tilted_map(rng, pitch_deg, roll_deg, verticals):
-    R_m_w = Rotation.from_euler("xyz", [0.6, -0.3, 1.0]).as_matrix()
-    R_w_c = cameras(pitch_deg=pitch_deg, roll_deg=roll_deg)
-    up = vertical(turned(room(rng, verticals=verticals), R_m_w), R_m_w @ R_w_c)
+    T_m_w = np.eye(4)
+    T_m_w[:3, :3] = Rotation.from_euler("xyz", [0.6, -0.3, 1.0]).as_matrix()
+    T_w_c = cameras(pitch_deg=pitch_deg, roll_deg=roll_deg)
+    up = vertical(turned(room(rng, verticals=verticals), T_m_w[:3, :3]), T_m_w @ T_w_c, DEPTH)
     assert up is not None
-    assert np.degrees(np.arccos(up.direction @ R_m_w[:, 2])) < 1.0
+    assert np.degrees(np.arccos(up.direction @ T_m_w[:3, 2])) < 1.0
     assert np.radians(1.0) < up.sigma_rad < np.radians(4.0)
 
 
 @pytest.mark.parametrize("roll_deg", [90.0, -90.0, 80.0])
 def test_a_rotated_phone_gives_no_tilted_vertical(rng, roll_deg):
-    assert vertical(room(rng), cameras(roll_deg=roll_deg)) is None
+    assert vertical(room(rng), cameras(roll_deg=roll_deg), DEPTH) is None
 
 
 def test_clutter_gives_no_vertical(rng):
-    assert vertical(room(rng, clutter=1.0, verticals=0.0), cameras()) is None
+    assert vertical(room(rng, clutter=1.0, verticals=0.0), cameras(), DEPTH) is None
 
 
 def test_an_uncertain_focal_length_increases_sigma_or_rejects(rng):
-    assert vertical(room(rng), cameras(), focal_sigma=0.45) is None
+    assert vertical(room(rng), cameras(), DEPTH, focal_sigma=0.45) is None
 
 
 def test_few_segments_give_no_vertical(rng):
-    assert vertical(room(rng, per_keyframe=1), cameras()) is None
+    assert vertical(room(rng, per_keyframe=1), cameras(), DEPTH) is None
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.01])
+def test_on_the_spot_horizontals_whose_directions_rest_on_depth_tell_nothing_but_verticals_do(rng, unit):
+    on_the_spot = cameras(pan_deg=120.0, moved=0.1 * unit)
+    assert vertical(room(rng, verticals=0.0), cameras(pan_deg=120.0, moved=2.0 * unit), DEPTH * unit) is not None
+    assert vertical(room(rng, verticals=0.0), on_the_spot, DEPTH * unit) is None
+    assert vertical(room(rng, verticals=0.6), on_the_spot, DEPTH * unit) is not None

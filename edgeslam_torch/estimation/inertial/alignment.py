@@ -25,6 +25,7 @@ from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.noise import (
     FAST_M_S,
     GRAVITY_M_S2,
+    IMU_AXES_RAD,
     IMU_BIAS_SIGMA,
     IMU_SCALE_LOG,
     KNOWN_LEVER_M,
@@ -95,7 +96,7 @@ class Alignment:
     @property
     def sigma_up_rad(self) -> float:
         """Standard deviation of the vertical per axis."""
-        return math.sqrt(0.5 * float(np.trace(self.covariance[_GRAVITY, _GRAVITY])))
+        return math.hypot(math.sqrt(0.5 * float(np.trace(self.covariance[_GRAVITY, _GRAVITY]))), IMU_AXES_RAD)
 
     @property
     def sigma_offset_s(self) -> float:

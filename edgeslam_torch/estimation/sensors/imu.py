@@ -29,7 +29,7 @@ _CONTRADICTED_RAD = math.radians(3.0)
 0.1 to 0.3 degrees."""
 _CONTRADICTED_SHARE, _CONTRADICTED_M = 0.05, 0.03
 """The same for visual positions, of the extent of the way and in metres; in flight 0.01 and 0.01 to 0.02 m."""
-_UPRIGHT_RAD = math.radians(1.0)
+_UPRIGHT_RAD = math.radians(1.2)
 """Maximum standard deviation of a vertical that levels the output."""
 _RECENT = 30
 """Number of parts, one a frame, of a copy for a prediction: a second."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.level import Up
 from edgeslam_torch.map.keyframe import Keyframe
@@ -57,6 +58,9 @@ _BUILT_RAD = math.radians(1.5)
 """Deviation of buildings from level, and accuracy of map directions."""
 _DEPTH_RAD = math.radians(2.0)
 """Common error of directions derived from depths."""
+_PIVOT = 0.015
+"""Distance from the camera of the point about which a map takes it to turn, relative to the depth. Depths and their
+common tilt are as wrong as this is large beside the camera's motion."""
 _CIRCLES_TELL = 5.0
 """Weight of segments along the vertical relative to those across it."""
 _BLOCKS = 4
@@ -102,17 +106,20 @@ def up_by_edges(keyframes: Sequence[Keyframe], hosts: Sequence[EdgePoints], came
         return None
     detector = cv2.createLineSegmentDetector(0)
     parts = [segments_of(k, points[k.id], camera, detector, number) for number, k in enumerate(voting)]
-    return vertical(_joined(parts), np.stack([k.T_c_w[:3, :3].T for k in voting]), camera.focal_sigma)
+    depth = float(np.median(np.concatenate([points[k.id].p_c[:, 2] for k in voting])))
+    return vertical(_joined(parts), np.stack([se3.inverse(k.T_c_w) for k in voting]), depth, camera.focal_sigma)
 
 
-def vertical(segments: Segments, R_w_c: FloatArray, focal_sigma: float = 0.0) -> Up | None:
+def vertical(segments: Segments, T_w_c: FloatArray, depth: float, focal_sigma: float = 0.0) -> Up | None:
     """Vertical from segments; None if they do not determine it.
 
     Args:
         segments: Of all keyframes.
-        R_w_c: ``(K, 3, 3)`` the keyframes' rotations, in temporal order.
+        T_w_c: ``(K, 4, 4)`` the keyframes' poses, in temporal order.
+        depth: Median depth of the edges [map units].
         focal_sigma: Relative standard deviation of the focal length.
     """
+    R_w_c = T_w_c[:, :3, :3]
     longest = np.sort(np.argsort(-segments.length, kind="stable")[:_MOST_SEGMENTS])
     segments = segments.take(longest)
     if len(longest) < _LEAST_SEGMENTS:
@@ -134,8 +141,16 @@ def vertical(segments: Segments, R_w_c: FloatArray, focal_sigma: float = 0.0) ->
     if explained < _LEAST or likely.max() < _ODDS * max(rivals, default=0.0) or upward < _FAR_FROM_UP:
         return None
     by_depth = float(share.across[0] / (share.across[0] + _CIRCLES_TELL * share.along[0]))
-    sigma = math.hypot(_BUILT_RAD, _DEPTH_RAD * by_depth, _jackknife(best, segments), 0.5 * focal_sigma)
+    depth_rad = math.hypot(_DEPTH_RAD, _PIVOT * depth * _turning(T_w_c))
+    sigma = math.hypot(_BUILT_RAD, depth_rad * by_depth, _jackknife(best, segments), 0.5 * focal_sigma)
     return Up(best, sigma, "edges") if sigma < _MAX_SIGMA else None
+
+
+def _turning(T_w_c: FloatArray) -> float:
+    """Rotation of a camera relative to its translation [rad / map unit], each root mean square about the mean."""
+    off = T_w_c[:, :3] - T_w_c[:, :3].mean(axis=0)
+    turned, moved = np.sum(off[:, :, :3] ** 2) / 2.0, np.sum(off[:, :, 3] ** 2)
+    return math.sqrt(float(turned) / max(float(moved), 1e-12))
 
 
 def segments_of(
