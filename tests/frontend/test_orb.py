@@ -105,3 +105,35 @@ def test_spread_is_as_even_as_the_corners_allow(rng):
     keep = spread(uv, score, 640, 480, 600)
     quarter = (uv[keep] // [320, 240]) @ [1, 2]
     assert np.bincount(quarter.astype(int), minlength=4).max() < 200
+
+
+def _joints(rng, grey):
+    """Draws the rough joints of a bare wall, which do not cross; returns points on them, away from the ends."""
+    points = []
+    for y in range(40, 440, 40):
+        line = np.linspace([340.0, y], [620.0, y + rng.uniform(-18, 18)], 60)
+        rough = line + rng.normal(0, 0.3, line.shape)
+        cv2.polylines(grey, [np.rint(16 * rough).astype(np.int32)], False, 70, 3, shift=4)
+        points.append(line[0] + np.linspace(0.15, 0.85, 200)[:, None] * (line[-1] - line[0]))
+    return np.concatenate(points)
+
+
+def test_keypoints_slide_along_edges_and_stay_on_corners_where_there_are_enough(rng):
+    wall = np.full((480, 640), 190, np.uint8)
+    wall[:300, :200] = patchwork(rng, 768, 900)[:300, :200, 0]
+    joints = _joints(rng, wall)
+    noisy = np.clip(wall + rng.normal(0, 2, wall.shape), 0, 255).astype(np.uint8)
+    everything = np.array(cv2.KeyPoint.convert(cv2.ORB.create(1500, fastThreshold=7).detect(noisy)))
+    kept = OrbExtractor(OrbConfig(), PRESETS["kinect"])(noisy).uv
+    on_joints = [np.linalg.norm(uv[:, None] - joints, axis=2).min(1) < 3.0 for uv in (everything, kept)]
+    assert on_joints[0].sum() > 100
+    assert on_joints[1].sum() < 0.1 * on_joints[0].sum()
+    assert (kept[:, 0] < 300).sum() > 300
+
+
+def test_without_corners_keypoints_on_edges_are_better_than_none(rng):
+    wall = np.full((480, 640), 190, np.uint8)
+    joints = _joints(rng, wall)
+    noisy = np.clip(wall + rng.normal(0, 2, wall.shape), 0, 255).astype(np.uint8)
+    kept = OrbExtractor(OrbConfig(), PRESETS["kinect"])(noisy).uv
+    assert (np.linalg.norm(kept[:, None] - joints, axis=2).min(1) < 3.0).sum() > 100
