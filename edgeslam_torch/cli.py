@@ -45,7 +45,8 @@ COMMANDS = {
 """Name: (module, one line of help). A command whose module is missing is not offered."""
 
 EXIT_INTERRUPTED = 130
-_IMPORTING = "<frozen importlib._bootstrap>"
+_SWALLOWING = ("<frozen importlib._bootstrap>", "/llvmlite/binding/executionengine.py")
+"""Ends of the names of files in whose functions exceptions are changed, or dropped by native code that calls them."""
 _AGAIN_S = 0.005
 """Short against the time between a command's last import and its first file."""
 
@@ -82,7 +83,7 @@ def main(argv: list[str] | None = None) -> int:
 
 class _CtrlC:
     """Ctrl-C, delayed while modules load: numpy converts it to another error, weak-reference callbacks swallow it,
-    and optional imports would treat it as a missing module."""
+    and optional imports would treat it as a missing module. Also while loops compile: LLVM swallows it."""
 
     def __init__(self) -> None:
         self.raised = False
@@ -106,7 +107,7 @@ class _CtrlC:
 
     def _on_signal(self, number: int, frame: "FrameType | None") -> None:
         while frame is not None:
-            if frame.f_code.co_filename == _IMPORTING:
+            if frame.f_code.co_filename.replace("\\", "/").endswith(_SWALLOWING):
                 self._postpone()
                 return
             frame = frame.f_back

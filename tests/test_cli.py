@@ -162,6 +162,32 @@ sys.exit(main())
     assert "Traceback" not in done.stderr
 
 
+def test_ctrl_c_while_loops_compile_is_not_lost():
+    """LLVM calls Python while it compiles, and drops what that raises."""
+    code = """
+import os, signal, sys, threading
+from llvmlite.binding.executionengine import ExecutionEngine
+from edgeslam_torch import cli, command_line
+
+find = ExecutionEngine._find_module_ptr  # called by the callback
+
+def interrupted(engine, pointer):
+    os.kill(os.getpid(), signal.SIGINT)
+    return find(engine, pointer)
+
+def command(words, commands):
+    import numba
+    ExecutionEngine._find_module_ptr = interrupted
+    numba.njit(lambda x: x + 1)(1)
+    threading.Event().wait(20)
+
+command_line.run_command = command
+sys.exit(cli.main())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "edgeslam: interrupted\n")
+
+
 def test_installed_program_runs(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "edgeslam_torch.cli", "run", str(tmp_path / "none")],

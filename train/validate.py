@@ -16,13 +16,19 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.metrics.depth_error import report_depth
+from edgeslam_torch.frontend.depth_check import CONTRADICTION, order_agreement
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.views.augment import View, fitted_view
+from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.posed import PosedView
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import DepthMap, FloatArray
 
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 10.0
+COMPARED = 10
+"""Maximum number of views whose labels are compared with the network's depth."""
+OTHER_UNIT = 3.0
+"""Ratio of labels and network that a foreign place does not explain; units in use are a factor of 4 or more apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +106,32 @@ def score(network: DepthModule, metadata: Metadata, views: Sequence[View]) -> De
     known = [column[~np.isnan(column)] for column in columns]  # images without edges have no error there
     means = [float(column.mean()) if len(column) else float("nan") for column in known]
     return DepthScores(*[*means, float(np.std(log_scale))])
+
+
+def contradiction(network: DepthModule, metadata: Metadata, folder: DepthFolder) -> str:
+    """How labels contradict a trained network: by their order or their unit; empty if they do not.
+
+    Raises:
+        SourceError: If the views that are compared have no labels.
+    """
+    network.eval()
+    views = folder.views
+    orders, ratios = [], []
+    compared = range(0, len(views), math.ceil(len(views) / COMPARED))
+    for view in (views[i] for i in compared):
+        depth_m, sigma_log = predict_metres(network, metadata, view)
+        known = (view.depth_m > 0) & (depth_m > 0)
+        if known.any():
+            orders.append(order_agreement(DepthMap(depth_m, sigma_log), DepthMap(view.depth_m, sigma_log)))
+            ratios.append(np.log(view.depth_m[known] / depth_m[known]).mean())
+    if not ratios:
+        raise SourceError(f"{folder.name}: no depth in any of {len(compared)} images")
+    if np.median(orders) < CONTRADICTION:
+        return f"{folder.name}: its depth is larger where the network's is smaller: disparities?"
+    factor = math.exp(float(np.median(ratios)))
+    if not 1.0 / OTHER_UNIT < factor < OTHER_UNIT:
+        return f"{folder.name}: its depth is {factor:.2g} times the network's: is its unit right?"
+    return ""
 
 
 def can_be_scored(view: View) -> bool:

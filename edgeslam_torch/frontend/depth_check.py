@@ -54,8 +54,8 @@ class CheckedDepth:
     """Wraps a depth function and discards implausible pixels and maps.
 
     A function with an attribute ``reference``, another depth function, is compared with it in its first `ORDER_MAPS`
-    maps and rejected if near and far are exchanged; its ``said_instead`` returns the likely interpretation of its
-    output. The map cannot detect this, as it is initialised from the same depth.
+    maps, and rejected while its ``contradiction`` names one in most of them. The map cannot detect this, as it is
+    initialised from the same depth.
 
     Args:
         depth: Function to check.
@@ -67,8 +67,8 @@ class CheckedDepth:
         """Depth maps requested."""
         self.refused = 0
         """Maps with less than `MIN_SHARE` usable pixels."""
-        self._agreement: list[float] = []
-        self._contradiction: str | None = None
+        self._contradictions: list[str] = []
+        self._said_contradiction = False
 
     def __call__(self, image: np.ndarray, camera: Camera) -> DepthMap | None:
         """The depth map with NaN at unusable pixels; None if too few are usable."""
@@ -85,22 +85,19 @@ class CheckedDepth:
             return None
         return depth if share == 1.0 else replace(depth, depth_m=np.where(good, depth.depth_m, np.float32(np.nan)))
 
-    def _contradicted(self, depth: DepthMap, image: np.ndarray, camera: Camera) -> bool:
-        """Whether the maps so far have near and far exchanged."""
-        if len(self._agreement) < ORDER_MAPS and (reference := getattr(self.depth, "reference", None)) is not None:
-            other = reference(image, camera)
-            found = order_agreement(depth, other)
-            self._agreement.append(0.0 if np.isnan(found) else found)
-            if self._inside_out() and self._contradiction is None:
-                self._contradiction = (
-                    "the depth network exchanges near and far compared with the shipped one: its depth is not used; "
-                    + self.depth.said_instead(image, camera, other)  # type: ignore[attr-defined]
-                )
-                logger.warning(self._contradiction)
-        return self._inside_out()
+    def _contradicted(self, depth: DepthMap, image: np.ndarray, camera: Camera) -> str | None:
+        """The contradiction with the reference in most maps so far; None if there is none."""
+        if len(self._contradictions) < ORDER_MAPS and (reference := getattr(self.depth, "reference", None)) is not None:
+            said = self.depth.contradiction(depth, image, camera, reference(image, camera))  # type: ignore[attr-defined]
+            self._contradictions.append(said)
+            if said and self._contradiction() and not self._said_contradiction:
+                self._said_contradiction = True
+                logger.warning(self._contradiction())
+        return self._contradiction()
 
-    def _inside_out(self) -> bool:
-        return bool(self._agreement) and bool(np.median(self._agreement) < CONTRADICTION)
+    def _contradiction(self) -> str | None:
+        named = [said for said in self._contradictions if said]
+        return f"{named[0]}: its depth is not used" if 2 * len(named) > len(self._contradictions) else None
 
     def _refuse(self, share: float) -> None:
         self.refused += 1
@@ -114,8 +111,8 @@ class CheckedDepth:
 
     def warning(self) -> str | None:
         """Warning about rejected maps; None if there were none."""
-        if self._inside_out():
-            return self._contradiction
+        if contradiction := self._contradiction():
+            return contradiction
         if not self.refused:
             return None
         return (

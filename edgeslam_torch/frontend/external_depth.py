@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.errors import WeightsError
-from edgeslam_torch.frontend.depth_check import DepthFunction
+from edgeslam_torch.frontend.depth_check import CONTRADICTION, DepthFunction, order_agreement
 from edgeslam_torch.frontend.network_input import check_image, network_size, preprocess
 from edgeslam_torch.frontend.onnx_session import device_of, first_line, open_session, words_of
 from edgeslam_torch.geometry.camera import Camera
@@ -41,6 +41,9 @@ SLOW_S = 1.0
 """Time per image above which a smaller input is suggested."""
 SAME_UNIT = 1.5
 """Maximum median log ratio of depths (a factor of 4.5) of two networks with the same unit."""
+OTHER_READING = 0.7
+"""Median log ratio (a factor of two) above which another reading is tried: metres read as their logarithm, or the
+reverse, are off by a factor of e or more."""
 _TRIAL_SIDE = 112
 """Side of the test images [px], rounded up: eight patches of a vision transformer."""
 
@@ -112,10 +115,14 @@ class ExternalDepth:
         given, sigma_log = self._given(image, camera)
         if network.is_relative:
             return DepthMap(relative_depth(given), sigma_log, is_relative=True)
+        return DepthMap(self._in_metres(given, camera, network.gives), sigma_log)
+
+    def _in_metres(self, given: FloatArray, camera: Camera, gives: str) -> FloatArray:
+        """Depth [m] for the camera."""
         height, width = self._input_size(camera)
-        lens = camera.scaled(width, height)
-        longer = float(np.sqrt(lens.fx * lens.fy)) / network.focal_px if network.focal_px else 1.0
-        return DepthMap(np.asarray(longer * _metres(given, network.gives), np.float32), sigma_log)
+        lens, focal_px = camera.scaled(width, height), self.network.focal_px
+        longer = float(np.sqrt(lens.fx * lens.fy)) / focal_px if focal_px else 1.0
+        return np.asarray(longer * _metres(given, gives), np.float32)
 
     def _input_size(self, camera: Camera) -> tuple[int, int]:
         training = (self.network.input_height, self.network.input_width)
@@ -145,21 +152,30 @@ class ExternalDepth:
         """The reference depth network; None without one."""
         return None if self._open_reference is None else self._open_reference()
 
-    def said_instead(self, image: NDArray[np.uint8], camera: Camera, reference: DepthMap) -> str:
-        """The value of ``gives`` that fits the network's output for an image better, given a reference depth map."""
+    def contradiction(self, depth: DepthMap, image: NDArray[np.uint8], camera: Camera, reference: DepthMap) -> str:
+        """How the description contradicts a reference depth map of the same image, and the value of ``gives`` that fits
+        better; empty if it does not.
+
+        Near and far are exchanged, or the output read as `Gives` says deviates from the reference by more than a factor
+        of two, and by less than half of that when read otherwise.
+        """
+        said = self.network.gives
+        inside_out = order_agreement(depth, reference) < CONTRADICTION
+        other_unit = not depth.is_relative and _deviation(depth.depth_m, reference) > OTHER_READING
+        if not (inside_out or other_unit):
+            return ""
         given = self._given(image, camera)[0]
-        known = np.isfinite(given) & np.isfinite(reference.depth_m)
-        z = reference.depth_m[known]
-        with np.errstate(over="ignore", invalid="ignore"):
-            deviation = {
-                gives: float(np.nanmedian(np.abs(np.log(_metres(given, gives)[known] / z))))
-                for gives in (Gives.METRES, Gives.LOG_METRES, Gives.INVERSE_METRES)
-            }
-        if self.network.gives in (Gives.METRES, Gives.LOG_METRES):  # output falls where the reference rises
-            fits = Gives.INVERSE_METRES if deviation[Gives.INVERSE_METRES] < SAME_UNIT else Gives.RELATIVE_INVERSE
-        else:
-            fits = Gives.LOG_METRES if deviation[Gives.LOG_METRES] < deviation[Gives.METRES] else Gives.METRES
-        return f"{self.weights.name} is described as {self.network.gives}, its numbers look like gives = '{fits}'"
+        deviation = {
+            gives: _deviation(self._in_metres(given, camera, gives), reference)
+            for gives in (Gives.METRES, Gives.LOG_METRES, Gives.INVERSE_METRES)
+        }
+        fits = Gives.LOG_METRES if deviation[Gives.LOG_METRES] < deviation[Gives.METRES] else Gives.METRES
+        if inside_out:
+            if said in (Gives.METRES, Gives.LOG_METRES):  # output falls where the reference rises
+                fits = Gives.INVERSE_METRES if deviation[Gives.INVERSE_METRES] < SAME_UNIT else Gives.RELATIVE_INVERSE
+        elif not deviation[fits] < 0.5 * deviation[Gives(said)]:
+            return ""
+        return f"{self.weights.name} is described as {said}, its numbers look like gives = '{fits}'"
 
     def _taken(self, height: int, width: int) -> tuple[int, int]:
         """The input size, with the sides that the graph fixes."""
@@ -211,6 +227,14 @@ class ExternalDepth:
             answers.append(given)
         if np.array_equal(answers[0], answers[1], equal_nan=True):
             raise WeightsError(f"{self.weights}: gives the same depth for different images")
+
+
+def _deviation(depth_m: FloatArray, reference: DepthMap) -> float:
+    """Median absolute log ratio of two depth maps; NaN without common pixels."""
+    known = np.isfinite(depth_m) & np.isfinite(reference.depth_m)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        apart = np.abs(np.log(depth_m[known] / reference.depth_m[known]))
+    return float(np.median(apart)) if apart.size else float("nan")
 
 
 def _plane(array: FloatArray) -> FloatArray:

@@ -25,8 +25,10 @@ from edgeslam_torch.navigation.skills.skill import Skill
 
 PLAN = "plan.jsonl"
 _HEAD = {"format": "edgeslam planner", "version": 3}
-_MAX_BYTES = 1 << 26
-"""Maximum size of a line and of an array in it; the largest view has 2 MB."""
+_MAX_LINE, _MAX_ARRAY = 1 << 24, 1 << 26
+"""Maximum number of bytes of a line and of an array in it; the largest view has 2 MB."""
+_MAX_RATIO, _MAX_UNPACKED = 50, 1 << 28
+"""All arrays of a record may have so many times the bytes of its file, and so many bytes more; real ones have ten."""
 _OURS = ("edgeslam_torch.navigation.", "edgeslam_torch.flying.")
 """Packages whose dataclasses may occur in a record; no other name is imported."""
 
@@ -86,7 +88,8 @@ def read_plan(path: Path) -> Iterator[Entry]:
     """
     try:
         with open_plain(path) as file:
-            lines = iter(lambda: file.readline(_MAX_BYTES), b"")
+            room = _Room(_MAX_RATIO * path.stat().st_size + _MAX_UNPACKED)
+            lines = iter(lambda: file.readline(_MAX_LINE), b"")
             head = _parsed(next(lines, b""), path, 1)
             if not isinstance(head, dict) or head.get("format") != _HEAD["format"]:
                 raise SourceError(f"{path}: not a planner's record")
@@ -95,7 +98,7 @@ def read_plan(path: Path) -> Iterator[Entry]:
             for number, line in enumerate(lines, 2):
                 if not line.endswith(b"\n"):
                     return  # truncated by a crash
-                yield _entry(_parsed(line, path, number), path, number)
+                yield _entry(_parsed(line, path, number), path, number, room)
     except FileNotFoundError as error:
         raise SourceError(f"{path}: not found; 'edgeslam fly ... --fly --record DIR' writes it") from error
     except OSError as error:
@@ -109,9 +112,21 @@ def _parsed(line: bytes, path: Path, number: int) -> Any:
         raise SourceError(f"{path}: line {number} is damaged or not a planner's record") from error
 
 
-def _entry(value: Any, path: Path, number: int) -> Entry:
+class _Room:
+    """Bytes that arrays of a record may still take."""
+
+    def __init__(self, size: int) -> None:
+        self._left = size
+
+    def take(self, size: int) -> None:
+        self._left -= size
+        if not 0 <= size <= min(_MAX_ARRAY, self._left):
+            raise ValueError(f"an array of {size} bytes")
+
+
+def _entry(value: Any, path: Path, number: int, room: _Room) -> Entry:
     try:
-        entry = _decoded(value)
+        entry = _decoded(value, room)
     except EdgeSlamError as error:
         raise SourceError(f"{path}: line {number}: {error}") from error
     except (TypeError, ValueError, KeyError, AttributeError, RecursionError, MemoryError, zlib.error) as error:
@@ -139,20 +154,21 @@ def _encoded(value: Any) -> Any:
     raise OutputError(f"a flight's record cannot hold a {type(value).__name__}")
 
 
-def _decoded(value: Any) -> Any:
+def _decoded(value: Any, room: _Room) -> Any:
     if isinstance(value, list):
-        return [_decoded(x) for x in value]
+        return [_decoded(x, room) for x in value]
     if not isinstance(value, dict):
         return value
     if "zlib" in value:
         kind, shape = np.dtype(value["dtype"]), [int(length) for length in value["shape"]]
         size = math.prod(shape) * kind.itemsize
-        if kind.kind not in "fiub" or not 0 <= size <= _MAX_BYTES:
-            raise ValueError(f"an array of {size} bytes")
+        if kind.kind not in "fiub":
+            raise ValueError(f"an array of {kind}")
+        room.take(size)
         unpacker = zlib.decompressobj()
         data = unpacker.decompress(base64.b64decode(value["zlib"]), size + 1)  # bounded: no decompression bombs
         return np.frombuffer(data, kind).reshape(shape).copy()
-    return _kind(value["kind"])(**{name: _decoded(x) for name, x in value.items() if name != "kind"})
+    return _kind(value["kind"])(**{name: _decoded(x, room) for name, x in value.items() if name != "kind"})
 
 
 def _kind(name: str) -> Any:

@@ -18,7 +18,7 @@ from edgeslam_torch.flying.replay import replay, summary
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.drone_state import HOVER, Contact, DroneState, View
-from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewSkill, PlanLog, read_plan
+from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewSkill, PlanLog, _encoded, read_plan
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.navigation.skills.explore import Explore
@@ -155,6 +155,12 @@ def _array(shape):
     return (json.dumps({"dtype": "<f8", "shape": shape, "zlib": _bomb()}) + "\n").encode()
 
 
+def _zeros():
+    """A line of 70 kB with an array of 50 MB, as large as one may be."""
+    zeros = np.zeros((5000, 10_000), np.uint8)
+    return (json.dumps(_encoded(NewSkill(ReturnHome(zeros)))) + "\n").encode()
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
@@ -167,6 +173,7 @@ def _array(shape):
         (lambda lines: [lines[0], *lines[3:]], "does not begin with the flight's limits"),
         (lambda lines: [lines[0], _array(shape=[3])], "line 2 is damaged"),
         (lambda lines: [lines[0], _array(shape=[10**12])], "line 2 is damaged"),
+        (lambda lines: [*lines[:2], *[_zeros()] * 40], "is damaged (an array of 50000000 bytes)"),
         (lambda lines: [lines[0], _array(shape=[-1])], "line 2 is damaged"),
         (lambda lines: [lines[0], b"[" * 100_000 + b"]" * 100_000 + b"\n"], "line 2 is damaged"),
         (lambda lines: lines[:2], "holds no state"),

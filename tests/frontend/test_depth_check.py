@@ -50,33 +50,32 @@ def test_rejections_give_one_warning_with_their_count(caplog):
 
 
 class Described:
-    """A network whose depth is ``power`` of the truth, beside one that gives the truth."""
+    """A network whose description a reference contradicts in some of its maps."""
 
-    def __init__(self, power, relative):
-        across = np.tile(np.linspace(1, 4, 320, dtype=np.float32), (240, 1))
-        sigma = np.full_like(across, 0.2)
-        self.map, self.truth = DepthMap(across**power, sigma, is_relative=relative), DepthMap(across, sigma)
+    reference = staticmethod(lambda image, camera: depth_map(2.0))
+
+    def __init__(self, contradicted):
+        self.contradicted = iter(contradicted)
 
     def __call__(self, image, camera):
-        return self.map
+        return depth_map(3.0)
 
-    def reference(self, image, camera):
-        return self.truth
-
-    def said_instead(self, image, camera, reference):
-        return "gives = 'metres'"
+    def contradiction(self, depth, image, camera, reference):
+        return "gives = 'metres'" if next(self.contradicted) else ""
 
 
-@pytest.mark.parametrize("relative", [False, True])
-def test_inverted_depth_is_rejected_with_one_warning(relative, caplog):
-    checked = CheckedDepth(Described(-1.0, relative))
+def test_contradicted_depth_is_rejected_with_one_warning(caplog):
+    checked = CheckedDepth(Described([True] * 5))
     with caplog.at_level(logging.WARNING):
         assert [checked(IMAGE, CAMERA) for _ in range(8)] == [None] * 8
     assert len(caplog.records) == 1
     assert "gives = 'metres'" in (checked.warning() or "")
-    right = CheckedDepth(Described(0.7, relative))
-    assert right(IMAGE, CAMERA) is right.depth.map
-    assert right.warning() is None
+
+
+def test_most_maps_decide_whether_depth_is_rejected():
+    checked = CheckedDepth(Described([True, False, False, True, False]))
+    assert [checked(IMAGE, CAMERA) is None for _ in range(8)] == [True, *[False] * 7]
+    assert checked.warning() is None
 
 
 @pytest.mark.parametrize("metres", [0.05, 0.3, 10.0, 100.0, 200.0])
@@ -96,4 +95,3 @@ def test_a_map_of_mostly_bad_pixels_is_rejected():
 def test_a_function_without_depth_is_no_failure():
     checked = CheckedDepth(lambda image, camera: None)
     assert checked(IMAGE, CAMERA) is None
-    assert checked.warning() is None

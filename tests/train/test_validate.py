@@ -7,8 +7,9 @@ from small_depth import METADATA, VIEW, small_depth
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.models.trainable import Prediction
-from edgeslam_torch.train.validate import coverage, score
+from edgeslam_torch.train.validate import contradiction, coverage, score
 from edgeslam_torch.train.views.augment import View
+from edgeslam_torch.train.views.datasets import DepthFolder
 
 
 def two_metres(x):
@@ -33,3 +34,20 @@ def test_coverage_of_a_normal_sigma_is_nominal(rng):
     one, two = coverage(rng.normal(0, sigma), sigma)
     assert one == pytest.approx(0.683, abs=0.02)
     assert two == pytest.approx(0.95, abs=0.01)
+
+
+def test_labels_in_another_unit_or_order_contradict_the_network():
+    network = small_depth()
+    ramp = torch.linspace(1.0, 4.0, 64)
+    network.predict = lambda x: Prediction(ramp.log().expand(len(x), 1, *x.shape[-2:]), None)
+    truth = np.tile(ramp.numpy(), (32, 1))
+
+    def said(depth):
+        views = [View(VIEW.image, depth.astype(np.float32), VIEW.K)] * 3
+        return contradiction(network, METADATA, DepthFolder("kitchen", views, ()))
+
+    assert said(truth) == said(1.5 * truth) == said(np.where(truth > 2, truth, 0)) == ""
+    assert "0.2 times" in said(0.2 * truth)
+    assert "disparities" in said(2.0 / truth)
+    with pytest.raises(SourceError, match="no depth"):
+        said(np.zeros_like(truth))

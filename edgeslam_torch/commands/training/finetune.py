@@ -80,6 +80,7 @@ def _finetune(
     out: "OutFolder",
 ) -> "TrainingResult":
     from edgeslam_torch.train.recipes.finetune import FromRuns, finetune
+    from edgeslam_torch.train.validate import contradiction
 
     from_runs = FromRuns(args.from_runs)
     reading = {name: getattr(args, name) for name in ("ignore_depth", "max_frames", "camera")}
@@ -90,6 +91,9 @@ def _finetune(
     data = _data(args, items, out)
     for line in data.describe():
         say(line)
+    for folder in (*data.labelled, *data.validation):
+        if said := contradiction(network, metadata, folder):
+            logger.warning(said)
     if not args.overwrite and 0 < (step := out.step) < args.steps:
         say(f"{out.path}: resumes after step {step}")
     return finetune(network, metadata, data, config, out, from_runs, reading, hooks, args.cache)
