@@ -27,6 +27,8 @@ _MAX_NUMBERS, _MAX_ITEMS = 1 << 16, 1 << 10
 """Elements of a fixed array: of numbers, and of anything whose reading is unrolled."""
 _SQL_STEPS = 100_000
 """Virtual-machine instructions between two looks at Ctrl-C: a few milliseconds."""
+_COMPUTED = "SELECT 1 FROM sqlite_schema AS t, pragma_table_xinfo(t.name) WHERE hidden > 1"
+"""Columns that are computed when they are read."""
 _TYPE = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
 _NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
 _COMMENT_OR_TEXT = re.compile(r'//[^\n]*|/\*.*?\*/|"(?:[^"\\\n]|\\.)*"', re.DOTALL)
@@ -115,7 +117,8 @@ class _UriPath(type(Path())):  # type: ignore[misc]
 
 @contextmanager
 def _sql_is_read_only_data() -> Iterator[None]:
-    """Databases opened inside hold tables alone: no views, nothing recursive; Ctrl-C ends what they compute."""
+    """Databases opened inside hold stored tables alone: no views, no computed columns, nothing recursive; Ctrl-C ends
+    what they compute."""
     import apsw
 
     def authorise(action: int, *names: str | None) -> int:
@@ -126,6 +129,8 @@ def _sql_is_read_only_data() -> Iterator[None]:
         connection.limit(apsw.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
         connection.authorizer = authorise
         connection.set_progress_handler(lambda: False, _SQL_STEPS)  # Python runs its signal handlers there
+        if connection.execute(_COMPUTED).fetchone() is not None:
+            raise SourceError(f"{connection.filename}: a table with computed columns is not read")
 
     apsw.connection_hooks.append(bound)
     try:

@@ -110,6 +110,9 @@ ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n)"
         f"ALTER TABLE message_definitions RENAME TO d; CREATE VIEW message_definitions AS {ENDLESS} "
         "SELECT 'a' AS topic_type, 'b' AS encoding, 'c' AS encoded_message_definition, 'd' AS type_description_hash, "
         "max(x) AS id FROM n",
+        "ALTER TABLE messages DROP COLUMN data; ALTER TABLE messages ADD COLUMN data AS (zeroblob(200000000))",
+        "ALTER TABLE messages DROP COLUMN data; ALTER TABLE messages ADD COLUMN half AS (x'00' || x'00'); "
+        "ALTER TABLE messages ADD COLUMN data AS (half || half)",
         "UPDATE topics SET name = x'00ff'",
         "UPDATE topics SET type = 5",
         "UPDATE topics SET name = x'00ff', type = x'00'",
