@@ -175,7 +175,8 @@ def _download(archive: Archive, target: Path, expected: str | None, progress: Pr
         except _Broken as error:
             reasons.append(f"{url} ({error})")
         except ValueError as error:
-            raise SourceError(f"{archive.file}: not the expected file; it was deleted ({error})") from error
+            pinned = "" if archive.checksum else f"; if its publisher has replaced it, remove {target}.sha256"
+            raise SourceError(f"{archive.file}: not the expected file; it was deleted ({error}){pinned}") from error
     raise SourceError(
         f"{archive.file}: download failed: {'; '.join(reasons)}; the part received is kept; "
         f"run the same command to resume. If the publisher has moved it, download it by hand and give --archive FILE"

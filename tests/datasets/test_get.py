@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -139,8 +140,19 @@ def test_first_download_is_trusted_and_a_changed_second_one_is_not(one, publishe
     target.rename(tmp_path / "rec" / "aside")
     publisher.files["/a.tgz"] = tum(5)
     assert get(tmp_path, "tum_fr1_a") == 1
-    assert "not the expected file" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "not the expected file" in error
     assert not target.exists()
+    Path(error.split("remove ")[1].strip()).unlink()
+    assert get(tmp_path, "tum_fr1_a") == 0
+
+
+def test_a_bad_first_answer_is_not_what_the_next_must_match(one, publisher, tmp_path):
+    for bad in (b"<html>try again later</html>", tum()[:-20], tgz({"other/rgb.txt": b"1.0 rgb/1.png\n"}), b""):
+        one(bad)
+        assert get(tmp_path, "tum_fr1_a") == 1
+    one(tum())
+    assert get(tmp_path, "tum_fr1_a") == 0
 
 
 def test_two_recordings_of_one_archive_are_one_download(shop, publisher, tmp_path):
