@@ -56,3 +56,10 @@ def test_floating_point_in_0_to_1_keeps_its_contrast(dtype, brightest):
 def test_noise_of_a_first_picture_beyond_the_others_does_not_set_the_range():
     thermal = (7000 + 1.5 * GREY).astype(np.uint16)
     assert levels_of([(GREY / 20).astype(np.uint16), *[thermal] * 4]) == levels_of([thermal] * 4)
+
+
+@pytest.mark.parametrize("picture", [np.zeros((4, 4), np.uint16), np.full((4, 4), np.nan, np.float32)])
+def test_pictures_without_contrast_say_nothing(picture):
+    levels = levels_of([picture])
+    assert (levels.black, levels.white) == (0.0, 65536.0)
+    assert not levels.eight_bits(picture).any()

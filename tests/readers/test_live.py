@@ -1,6 +1,7 @@
 import signal
 import threading
 
+import cv2
 import numpy as np
 import pytest
 
@@ -8,7 +9,7 @@ from edgeslam_torch.cli import main
 from edgeslam_torch.drone.emulator.server import TelloEmulator
 from edgeslam_torch.drone.video_stream import Picture
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.readers.live import LiveSource, open_live
+from edgeslam_torch.readers.live import CaptureFeed, LiveSource, open_live
 
 
 class FakeFeed:
@@ -115,3 +116,22 @@ def test_webcams_are_numbered(spec):
 def test_flying_needs_a_drone(capsys):
     assert main(["record", "webcam:0", "--fly"]) == 1
     assert "--fly" in capsys.readouterr().err
+
+
+def test_remarks_on_what_came_are_warnings_once():
+    source = LiveSource("webcam:0", FakeFeed([1]), [], None, None, is_drone=False)
+    assert len(list(source.frames())) == 1
+    source.close()
+    assert [w for w in source.warnings if "refused" in w] == ["webcam:0: 3 packets refused"]
+
+
+def test_capture_gives_pictures_with_arrival_times(tmp_path):
+    path = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, (64, 48))
+    for k in range(10):
+        writer.write(np.full((48, 64, 3), 20 * k, np.uint8))
+    writer.release()
+    feed = CaptureFeed(str(path), "clip")
+    picture = feed.wait(0, 5.0)
+    assert picture.image.shape == (48, 64, 3)
+    feed.close()

@@ -294,3 +294,9 @@ def test_a_mistyped_name_is_answered_with_the_one_that_is_there(tmp_path):
     (tmp_path / "tum_fr1_xyz").mkdir()
     with pytest.raises(SourceError, match=r"no such file or folder; did you mean .*tum_fr1_xyz\?"):
         open_source(tmp_path / "tum_fr1_xy")
+
+
+def test_lens_that_turns_back_in_the_corners_is_used_with_a_warning(tmp_path, write_tum):
+    folder = write_tum(tmp_path, 2)
+    save_camera(folder / "camera.yaml", Camera(64, 48, 40.0, 40.0, 31.5, 23.5, (-0.3, 0.0, 0.0, 0.0, 0.0)))
+    assert "turns back at 70 % of the way to the border" in open_source(folder).warnings[0]

@@ -246,3 +246,15 @@ def test_mcap_of_ros1_that_was_not_closed_is_refused_with_the_remedy(tmp_path):
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(SourceError, match="mcap recover"):
         list(open_source(path).frames())
+
+
+def test_sixteen_bits_of_a_thermal_camera_are_read_where_the_topic_is_named(tmp_path):
+    data = (7000 + 100 * np.arange(48 * 64).reshape(48, 64) % 1500).astype(np.uint16)
+    times = [BEGIN_S + i / 30 for i in range(3)]
+    path = bags.write_mcap(tmp_path / "a.mcap", [("/t/image", IMAGE, t, bags.picture(t, data, "16UC1")) for t in times])
+    with pytest.raises(SourceError, match="--topic /t/image"):
+        open_source(path)
+    source = open_source(path, topics=["/t/image"])
+    image = next(iter(source.frames())).image
+    assert image.dtype == np.uint8 and np.ptp(image.astype(int)) > 10
+    assert any("16UC1" in problem.reason for problem in source.problems)

@@ -1,12 +1,15 @@
 """Bags written by others' libraries, read as sources."""
 
+import math
+from pathlib import Path
+
 import bag_files as bags
 import cv2
 import numpy as np
 import pytest
 
 from edgeslam_torch import cli
-from edgeslam_torch.errors import MissingPackageError, SourceError
+from edgeslam_torch.errors import CalibrationError, MissingPackageError, SourceError
 from edgeslam_torch.readers.source import open_source
 
 pytest.importorskip("rosbags")
@@ -176,3 +179,34 @@ def test_topics_are_listed_with_what_they_are_used_as(tmp_path, capsys):
     assert "".join(lines["/depth/image"][4:]) == "notused(depthmap,16UC1)"
     assert cli.main(["topics", str(tmp_path / "no.bag")]) == 1
     assert "no such file" in capsys.readouterr().err
+
+
+def test_missing_and_empty_camera_info_are_said(tmp_path):
+    without = open_source(bags.write_mcap(tmp_path / "a.mcap", bags.pictures(_times(2))))
+    assert "no calibration found" in without.warnings[0]
+    info = ("/cam/camera_info", INFO, BEGIN_S, bags.camera_info((64, 48), 0.0))
+    empty = open_source(bags.write_mcap(tmp_path / "b.mcap", [info, *bags.pictures(_times(2))]))
+    assert "no calibration found" in empty.warnings[0] and "empty calibration" in _reasons(empty)
+
+
+def test_a_folder_without_metadata_is_read_if_it_has_one_file(tmp_path):
+    folder = bags.write_ros2(tmp_path / "a", bags.pictures(_times(3)))
+    (folder / "metadata.yaml").unlink()
+    assert open_source(folder).length == 3
+    Path(folder / "b.mcap").write_bytes(b"")
+    with pytest.raises(SourceError, match=r"no metadata.yaml beside a.db3, b.mcap"):
+        open_source(folder)
+
+
+def test_a_lens_that_ours_cannot_express_is_refused_in_one_line(tmp_path):
+    wide = bags.camera_info((64, 48), 20.0, (-0.01, 0.02, -0.005, 0.001), "equidistant")
+    path = bags.write_mcap(tmp_path / "a.mcap", [("/cam/camera_info", INFO, BEGIN_S, wide), *bags.pictures(_times(2))])
+    with pytest.raises(CalibrationError, match="--camera FILE"):
+        open_source(path)
+    assert math.isfinite(open_source(path, camera=_any_camera(tmp_path)).camera.fx)
+
+
+def _any_camera(folder):
+    path = folder / "camera.yaml.mine"
+    path.write_text("width: 64\nheight: 48\nfx: 70\nfy: 70\ncx: 31\ncy: 23\n")
+    return path

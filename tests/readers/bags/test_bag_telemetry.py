@@ -130,3 +130,9 @@ def test_a_fast_topic_is_thinned(tmp_path):
     samples = _read(tmp_path, odometry).telemetry
     assert 90 < len(samples) < 115
     _check(samples)
+
+
+def test_an_imu_that_measures_no_attitude_is_not_used(tmp_path):
+    for known in (False, True):  # covariance -1, and a constant
+        bag = _read(tmp_path, [("/imu", IMU, t, bags.imu(t, 0.3, known=known)) for t in TIMES])
+        assert bag.telemetry == [] and any("holds no attitude" in remark for remark in bag.remarks)

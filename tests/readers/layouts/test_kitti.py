@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.errors import CalibrationError, SourceError
+from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.readers.source import open_source
 
 CALIB = "P0: 700 0 31.5 0 0 701 23.5 0 0 0 1 0\nP2: 710 0 30.5 44.8 0 711 22.5 0.2 0 0 1 0.003\n"
@@ -48,3 +49,11 @@ def test_bad_files_are_named(sequence):
 def test_image_without_a_stamp_is_left_out_by_name(sequence, write_images):
     write_images(sequence / "image_2", ["000004.png", "cover.png"])
     assert [p.reason for p in open_source(sequence).problems] == ["its name is not a line of times.txt"] * 2
+
+
+def test_evaluation_reads_the_same_clock(sequence):
+    dataset = open_dataset(sequence)
+    np.testing.assert_allclose(dataset.truth.stamps_s, [0.0, 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(dataset.truth.positions[:, 2], [0.0, 1.0, 2.0, 3.0])
+    np.testing.assert_allclose(dataset.frame_stamps_s, [0.0, 0.1, 0.3])
+    assert dataset.truth.stamped and dataset.camera is not None and dataset.camera.fy == 711.0
