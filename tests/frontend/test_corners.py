@@ -124,3 +124,25 @@ def test_most_keeps_the_longest_arms(rng):
     everything, few = detect(image), detect(image, JunctionConfig(most=5))
     assert len(few) == 5
     np.testing.assert_array_equal(few.uv, everything.uv[:5])
+
+
+def check_turning(grey, least):
+    """Turning an image by a right angle moves no pixel value, so nearly all junctions must come again."""
+    found = detect(grey)
+    again = detect(np.ascontiguousarray(cv2.rotate(grey, cv2.ROTATE_90_COUNTERCLOCKWISE)))
+    back = np.stack([grey.shape[1] - 1 - again.uv[:, 1], again.uv[:, 0]], 1)
+    assert len(found) >= least
+    distance = np.linalg.norm(found.uv[:, None] - back[None], axis=2).min(1)
+    assert (distance < 1.0).mean() > 0.8
+    assert np.median(distance[distance < 1.0]) < 0.2
+
+
+def test_turning_a_rendered_image_turns_its_junctions(rng):
+    check_turning(frame(rng)[0], least=30)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("sequence", ["tum_fr1_xyz", "7scenes_redkitchen"])
+def test_turning_a_real_image_turns_its_junctions(sequence, data_dir):
+    image = min((data_dir / sequence).rglob("*.jpg"))
+    check_turning(cv2.imread(str(image), cv2.IMREAD_GRAYSCALE), least=8)
