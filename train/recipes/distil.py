@@ -35,6 +35,7 @@ from edgeslam_torch.train.processes.distributed import rank, world
 from edgeslam_torch.train.recipes.finetune import Data, finetune
 from edgeslam_torch.train.state import TrainConfig
 from edgeslam_torch.train.teachers.teach import at_points, kept_depth, log_metres, teach
+from edgeslam_torch.train.validate import contradiction
 from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView
 from edgeslam_torch.types import FloatArray
@@ -104,14 +105,14 @@ def _copied(new: nn.Module, old: nn.Module) -> bool:
     return True
 
 
-def label(teacher: DepthNetwork, sequence: PosedSequence, log_scale: float, folder: Path) -> DepthFolder:
+def label(teacher: DepthNetwork, sequence: PosedSequence, log_scale: float, kept: Path) -> DepthFolder:
     """Dense depth [m] of a run's views by a teacher: measured where the plane sweep is confirmed, else the teacher's.
 
     Args:
         teacher: The larger network.
         sequence: The run.
         log_scale: Log of metres per map unit.
-        folder: From `kept_depth`.
+        kept: From `kept_depth`.
 
     Raises:
         SourceError: If the teacher agrees with no view of the map.
@@ -126,7 +127,7 @@ def label(teacher: DepthNetwork, sequence: PosedSequence, log_scale: float, fold
             return np.full(view.image.shape[:2], np.nan, np.float32)
         return depth
 
-    taught = teach(predict, sequence, log_scale, folder)
+    taught = teach(predict, sequence, log_scale, kept)
     views = [t.view for t in taught if (t.view.depth_m > 0).any()]
     if not views or (len(without) == len(taught) and world() == 1):
         raise SourceError(f"{sequence.name}: {teacher.weights.name} agrees with the map in none of its views")
@@ -134,7 +135,10 @@ def label(teacher: DepthNetwork, sequence: PosedSequence, log_scale: float, fold
         logger.warning(
             "%s: %d images without the teacher's depth: it disagrees with the map", sequence.name, len(without)
         )
-    return DepthFolder(sequence.name, views, tuple(without))
+    folder = DepthFolder(sequence.name, views, tuple(without))
+    if said := contradiction(*load_checkpoint(None), folder):
+        logger.warning(said)
+    return folder
 
 
 def brought_to_map(teacher: DepthNetwork, view: PosedView, log_scale: float) -> FloatArray | None:

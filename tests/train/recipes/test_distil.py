@@ -83,6 +83,13 @@ def test_labels_are_measured_where_they_can_be_and_the_teachers_elsewhere(sequen
         assert np.median(off) < 0.03 and np.mean(off < 0.1) > 0.8
 
 
+def test_a_teacher_whose_metres_are_others_is_warned_of(sequence, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(teach, "MOST", 2)
+    for times, warned in ((1.0, False), (12.0, True)):
+        label(Oracle(sequence, lambda z, k=times: k * z), sequence, float(np.log(times)), tmp_path / str(times))
+        assert ("times the network's" in caplog.text) == warned
+
+
 @pytest.mark.parametrize("variant", [Variant.PRUNED, Variant.NNCONV5DW])
 def test_student_begins_with_what_fits_of_the_shipped_weights(variant):
     student, metadata = new_student(variant)
