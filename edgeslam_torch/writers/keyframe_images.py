@@ -2,9 +2,10 @@
 
 import logging
 from pathlib import Path
+from typing import Protocol
 
 from edgeslam_torch.files.plain import subfolder, write_image
-from edgeslam_torch.types import Frame, SlamOutput
+from edgeslam_torch.types import Frame, Observations, SlamOutput
 
 logger = logging.getLogger(__name__)
 
@@ -13,16 +14,25 @@ _JPEG_QUALITY = 95
 """As cameras store them; a photogrammetry program sees no difference to the original."""
 
 
+class _Slam(Protocol):
+    """The part of `EdgeSlam` that is used."""
+
+    def observations(self) -> Observations:
+        """Of the final map's keyframes."""
+
+
 class KeyframeImages:
     """A listener of `edgeslam_torch.run.run`; a disk that fills up ends the pictures, not the run."""
 
     def __init__(self, run_folder: Path) -> None:
         self._run_folder = run_folder
         self._begun = self._failed = False
+        self._may_become: dict[str, Path] = {}
+        """Pictures of frames without a map, by stamp: the map that is found later may begin with them."""
 
     def on_frame(self, frame: Frame, output: SlamOutput, slam: object) -> None:
-        """Write the picture of a keyframe, named by its stamp."""
-        if self._failed or not output.keyframe:
+        """Write the picture of a keyframe, or of a frame that may become one, named by its stamp."""
+        if self._failed or (output.status.supported and not output.keyframe):
             return
         try:
             folder = subfolder(self._run_folder, FOLDER)
@@ -30,13 +40,23 @@ class KeyframeImages:
                 for path in kept_images(self._run_folder).values():  # of an older run that this one replaces
                     path.unlink()
             self._begun = True
-            write_image(folder / f"{frame.stamp_s:.6f}.jpg", frame.image, (1, _JPEG_QUALITY))  # IMWRITE_JPEG_QUALITY
+            path = folder / _name(frame.stamp_s)
+            write_image(path, frame.image, (1, _JPEG_QUALITY))  # IMWRITE_JPEG_QUALITY
+            if not output.keyframe:
+                self._may_become[path.name] = path
         except OSError as error:
             self._failed = True
             logger.warning("images of keyframes are not kept any more (%s)", error.strerror or error)
 
-    def on_finish(self, slam: object) -> None:
-        """Nothing more to write."""
+    def on_finish(self, slam: _Slam) -> None:
+        """Remove the pictures of frames that became no keyframes."""
+        became = {_name(stamp_s) for stamp_s in slam.observations().stamps_s.tolist()}
+        for name in self._may_become.keys() - became:
+            self._may_become[name].unlink(missing_ok=True)
+
+
+def _name(stamp_s: float) -> str:
+    return f"{stamp_s:.6f}.jpg"
 
 
 def kept_images(run_folder: Path) -> dict[float, Path]:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.eval.report.keyframe_pictures import image_paths
-from edgeslam_torch.types import Frame
+from edgeslam_torch.types import Frame, FrameStatus
 from edgeslam_torch.writers.keyframe_images import KeyframeImages, kept_images
 
 
@@ -15,11 +15,14 @@ def _frame(index):
     return Frame(index, 100.0 + index, image)
 
 
-def _played(folder, frames, keyframes):
+def _played(folder, frames, keyframes, starting=(), became=()):
+    """Frames of which some are keyframes, and some are while a map is sought; of these, some become keyframes."""
     kept = KeyframeImages(folder)
     for index in frames:
-        kept.on_frame(_frame(index), SimpleNamespace(keyframe=index in keyframes), None)
-    kept.on_finish(None)
+        status = FrameStatus.STARTING if index in starting else FrameStatus.TRACKED
+        kept.on_frame(_frame(index), SimpleNamespace(keyframe=index in keyframes, status=status), None)
+    stamps_s = np.array([100.0 + index for index in {*keyframes, *became}])
+    kept.on_finish(SimpleNamespace(observations=lambda: SimpleNamespace(stamps_s=stamps_s)))
 
 
 def test_keyframes_alone_are_kept_and_found_by_their_stamps(tmp_path):
@@ -29,6 +32,11 @@ def test_keyframes_alone_are_kept_and_found_by_their_stamps(tmp_path):
     assert none is None
     for path, index in ((one, 1), (four, 4)):
         assert np.abs(cv2.imread(str(path)).astype(int) - _frame(index).image).mean() < 2.0
+
+
+def test_frames_that_a_map_begins_with_later_are_kept(tmp_path):
+    _played(tmp_path, range(6), {0, 3}, starting={0, 1, 2}, became={1})
+    assert list(kept_images(tmp_path)) == [100.0, 101.0, 103.0]
 
 
 def test_those_of_a_replaced_run_go_and_files_of_others_stay(tmp_path):
