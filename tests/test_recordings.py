@@ -22,11 +22,11 @@ BARS = {
     "euroc_mh05_a": (0.0311, 0.0359, 1.0, 40_000),
     "fr3_notexture_a": (0.0129, 0.0160, 0.99, 4_900),
     "hololens_a": (0.2300, 0.3000, 0.92, 40_000),
-    "tartan_hospital": (0.2900, 0.2900, 0.98, 76_000),
+    "tartan_hospital": (0.1600, 0.1900, 0.98, 30_000),
 }
 
 STARTS = {"tum_fr1_rpy_depth": (0, 3, 5)}
-"""First frames of runs of which the median counts, where the start moves the error by a quarter."""
+"""First frames of runs whose median counts where the start moves the error by a quarter, the map by half."""
 
 
 @pytest.mark.parametrize("name", BARS)
@@ -34,16 +34,17 @@ def test_sequence_is_within_its_bar(data_dir, tmp_path, name):
     """Figures of images alone with a margin; those that a user's flight is like beside those that were tuned on."""
     ate_m, live_m, share, points = BARS[name]
     images = replace(open_source(data_dir / name), imu=None, imu_readings=None)
-    errors = []
+    errors, edge_points = [], []
     for start in STARTS.get(name, (0,)):
         result = run(images.part(start, 1) if start else images, tmp_path / f"out{start}", SlamConfig())
         score = evaluate_run(result.folder, data_dir / name, judge_map=False)
         errors.append((score.ate_sim3_m, score.ate_online_sim3_m))
         assert score.coverage >= share
-        assert result.summary["map"]["edge_points"] >= points
+        edge_points.append(result.summary["map"]["edge_points"])
         assert [p for p in result.summary["pieces"] if p["supported"]] == result.summary["pieces"]
         assert len(result.summary["pieces"]) == 1
     assert (np.median(errors, axis=0) <= [ate_m, live_m]).all()
+    assert np.median(edge_points) >= points
 
 
 def test_two_runs_of_a_recording_give_the_same_bytes(data_dir, tmp_path):

@@ -38,7 +38,7 @@ def recordings(tmp_path_factory):
     """Three short simulated flights, and three broken recordings."""
     folder = tmp_path_factory.mktemp("fleet") / "recordings"
     for seed in range(3):
-        record(folder / f"flight_{seed}", DemoSettings("corridor", 2.0, 15.0, seed, width=320, height=240))
+        record(folder / f"flight_{seed}", DemoSettings("corridor", 2.6, 15.0, seed, width=320, height=240))
     (folder / "empty").mkdir()
     (folder / "clip.mp4").write_bytes(b"no video")
     (folder / "no_image" / "rgb").mkdir(parents=True)
