@@ -216,7 +216,8 @@ def test_a_gpu_gives_the_processors_loss(case, dtype):
 
 @pytest.mark.parametrize(
     ("case", "name"),
-    [pytest.param(case, name, id=f"{of} {name}") for of, case in CASES.items() for name in dict.fromkeys((case.predicted, "T_j_i"))
+    [pytest.param(case, name, id=f"{of} {name}") for of, case in CASES.items()
+     for name in dict.fromkeys((case.predicted, "T_j_i"))
      if name in case.given() and (of, name) != ("angle, right", "T_j_i")],
 )  # fmt: skip
 def test_what_is_predicted_as_nan_is_seen_in_its_item_alone(case, name):
