@@ -1,5 +1,6 @@
 """Images that repeat the previous one: a frozen camera, a stuck encoder, or a frame rate raised by copies."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -23,13 +24,13 @@ class RepeatedImages:
     def __init__(self) -> None:
         self._reference: NDArray[np.int16] | None = None
         """First image of the current stretch, against which slow motion accumulates."""
-        self._since_s = 0.0
+        self._since_s, self._began_s = 0.0, math.inf
         self._long: dict[float, float] = {}
         """First to last stamp of long stretches."""
 
     def repeats(self, grey: NDArray[np.uint8], stamp_s: float) -> bool:
         """Whether an image ``(H, W)`` repeats the current stretch."""
-        grid = grey[::_GRID, ::_GRID].astype(np.int16)
+        grid, self._began_s = grey[::_GRID, ::_GRID].astype(np.int16), min(self._began_s, stamp_s)
         if self._reference is None or _change(self._reference, grid) >= _MIN_CHANGE:
             self._reference, self._since_s = grid, stamp_s
             return False
@@ -42,11 +43,11 @@ class RepeatedImages:
         stretches = [stretch for stretch in self._long.items() if not hovers(*stretch)]
         if not stretches:
             return None
-        first, last = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
+        first, last = (s - self._began_s for s in max(stretches, key=lambda stretch: stretch[1] - stretch[0]))
         times = "" if len(stretches) == 1 else f" {len(stretches)} times, the longest"
         return (
-            f"the video froze{times} from {first:.1f} to {last:.1f} s, the same image repeated: "
-            "where the camera moved meanwhile is not known"
+            f"the video froze{times} from {first:.1f} to {last:.1f} s after the first frame, the same image "
+            "repeated: where the camera moved meanwhile is not known"
         )
 
 
