@@ -168,8 +168,14 @@ class FrameFeatures(Record):
     """``(N,)`` orientation, float32."""
     descriptors: NDArray[np.uint8]
     """``(N, 32)`` ORB bits."""
+    corner: NDArray[np.bool_] | None = None
+    """``(N,)`` whether they lie on corners, and not on straight edges, along which they slide; None: all."""
     faint: bool = False
     """Whether the image has too few clear corners, so that fainter ones are among these."""
+
+    def on_corners(self, keypoint: IntArray) -> NDArray[np.bool_]:
+        """Which of some keypoints ``(M,)`` lie on corners."""
+        return np.ones(len(keypoint), bool) if self.corner is None else np.asarray(self.corner[keypoint])
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -1,6 +1,5 @@
 """ORB keypoints spread evenly over the image (Rublee et al., ICCV 2011)."""
 
-import math
 import threading
 from dataclasses import dataclass
 
@@ -8,20 +7,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.compiled import compiled
 from edgeslam_torch.config import OrbConfig
+from edgeslam_torch.frontend.aperture import are_corners
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
 CANDIDATES = 1500
 """Minimum number of corners that are detected before they are spread evenly."""
-MIN_EIGENVALUE_RATIO = 0.1
-"""Of the structure tensor around a keypoint. On a straight edge it is smaller: a keypoint slides along the edge, by
-several pixels on the joints of bare walls, and what it slides by looks like motion (Lowe, IJCV 2004, section 4.1)."""
-_WINDOW = 5
-"""Half width of the structure tensor's window [px of the keypoint's octave]."""
-_BLUR_PX = 1.0
-"""Smoothing before: the stairs of a slanted line would be corners."""
 FAINT_SHARE = 0.5
 """Number of corners, relative to the requested keypoints, below which the image is searched again for fainter ones."""
 CORNER_SHARE = 0.3
@@ -47,43 +39,46 @@ class OrbExtractor:
 
     def __call__(self, grey: np.ndarray) -> FrameFeatures:
         """Features of a grey image ``(H, W)`` uint8 with the lens distortion still in it."""
-        found, kept = self._best(grey, np.asarray(cv2.GaussianBlur(grey, (5, 5), _BLUR_PX), dtype=np.uint8))
-        keep = kept[spread(found.uv[kept], found.score[kept], grey.shape[1], grey.shape[0], self.config.features)]
+        found = self._found(grey)
+        use = (
+            np.arange(len(found.uv))
+            if found.corners < CORNER_SHARE * self.config.features
+            else np.flatnonzero(found.corner)
+        )
+        keep = use[spread(found.uv[use], found.score[use], grey.shape[1], grey.shape[0], self.config.features)]
         return FrameFeatures(
             uv=self.camera.undistort_points(found.uv[keep]),
             octave=found.octave[keep],
             angle_rad=found.angle_rad[keep],
             descriptors=found.descriptors[keep],
+            corner=found.corner[keep],
             faint=found.faint,
         )
 
-    def _best(self, grey: NDArray[np.uint8], smooth: NDArray[np.uint8]) -> tuple["_Found", IntArray]:
-        """Keypoints and which to use: corners, faint ones too where there are few (bare walls, low light); all where
-        there are too few of those, as those on edges are better than none."""
-        enough, least = FAINT_SHARE * self.config.features, CORNER_SHARE * self.config.features
-        clear = self._found(grey, faint=False)
-        corner = clear.corners(smooth, self.config.scale_factor)
-        if len(corner) >= enough:
-            return clear, corner
-        faint = self._found(grey, faint=True)
-        corner = faint.corners(smooth, self.config.scale_factor)
-        if len(corner) >= least:
-            return faint, corner
-        found = clear if len(clear.uv) >= enough else faint
-        return found, np.arange(len(found.uv))
+    def _found(self, grey: NDArray[np.uint8]) -> "_Found":
+        """Keypoints, faint ones too where there are few clear corners: bare walls, low light."""
+        enough = FAINT_SHARE * self.config.features
+        clear = self._detected(grey, faint=False)
+        if clear.corners >= enough:
+            return clear
+        faint = self._detected(grey, faint=True)
+        too_few = faint.corners < CORNER_SHARE * self.config.features
+        return clear if too_few and len(clear.uv) >= enough else faint
 
-    def _found(self, grey: NDArray[np.uint8], faint: bool) -> "_Found":
+    def _detected(self, grey: NDArray[np.uint8], faint: bool) -> "_Found":
         # All candidates are described, in one call: a second call would build the image pyramid again.
         with self._one_at_a_time:
             found, descriptors = self._detectors[faint].detectAndCompute(grey, None)
         octave = np.array([k.octave for k in found], dtype=np.int32)
         pixel = np.array(cv2.KeyPoint.convert(found)).reshape(-1, 2)
+        uv = _in_image(pixel, octave, self.config.scale_factor, grey.shape[::-1])
         return _Found(
-            uv=_in_image(pixel, octave, self.config.scale_factor, grey.shape[::-1]),
+            uv=uv,
             octave=octave,
             angle_rad=np.deg2rad(np.array([k.angle for k in found], dtype=np.float32)),
             score=np.array([k.response for k in found], dtype=np.float32),
             descriptors=np.zeros((0, 32), np.uint8) if descriptors is None else np.asarray(descriptors, dtype=np.uint8),
+            corner=are_corners(grey, uv, self.config.scale_factor ** octave.astype(np.float64)),
             faint=faint,
         )
 
@@ -97,43 +92,14 @@ class _Found:
     angle_rad: FloatArray
     score: FloatArray
     descriptors: NDArray[np.uint8]
+    corner: NDArray[np.bool_]
+    """``(N,)`` Whether they lie on corners; the others lie on straight edges."""
     faint: bool
 
-    def corners(self, smooth: NDArray[np.uint8], scale_factor: float) -> IntArray:
-        """Those that are corners."""
-        ratio = _eigenvalue_ratio(smooth, self.uv, scale_factor ** self.octave.astype(np.float64))
-        return np.flatnonzero(ratio > MIN_EIGENVALUE_RATIO)
-
-
-@compiled("u1[:,::1], f4[:,::1], f8[::1]")
-def _eigenvalue_ratio(grey: NDArray[np.uint8], uv: FloatArray, scale: FloatArray) -> FloatArray:
-    """Smaller by larger eigenvalue ``(N,)`` of the structure tensor: 0 on a straight edge, 1 on an isotropic corner.
-
-    Args:
-        grey: Smoothed image ``(H, W)``.
-        uv: Keypoints ``(N, 2)``.
-        scale: ``(N,)`` of their octaves, the distance of samples [px].
-    """
-    height, width = grey.shape
-    ratio = np.zeros(len(uv))
-    for n in range(len(uv)):
-        a, b, c, step = 0.0, 0.0, 0.0, scale[n]
-        for i in range(-_WINDOW, _WINDOW + 1):
-            above = min(max(int(uv[n, 1] + (i - 1) * step + 0.5), 0), height - 1)
-            at = min(max(int(uv[n, 1] + i * step + 0.5), 0), height - 1)
-            below = min(max(int(uv[n, 1] + (i + 1) * step + 0.5), 0), height - 1)
-            for j in range(-_WINDOW, _WINDOW + 1):
-                left = min(max(int(uv[n, 0] + (j - 1) * step + 0.5), 0), width - 1)
-                here = min(max(int(uv[n, 0] + j * step + 0.5), 0), width - 1)
-                right = min(max(int(uv[n, 0] + (j + 1) * step + 0.5), 0), width - 1)
-                x = float(grey[at, right]) - float(grey[at, left])
-                y = float(grey[below, here]) - float(grey[above, here])
-                a += x * x
-                b += x * y
-                c += y * y
-        spread = math.sqrt((a - c) * (a - c) + 4.0 * b * b)
-        ratio[n] = (a + c - spread) / max(a + c + spread, 1.0)
-    return ratio
+    @property
+    def corners(self) -> int:
+        """Number of corners."""
+        return int(self.corner.sum())
 
 
 def _in_image(uv: FloatArray, octave: IntArray, scale_factor: float, size: tuple[int, int]) -> FloatArray:

@@ -6,12 +6,10 @@ A submap starts with the flight, and at the predicted pose after a while without
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeslam_torch.atlas.atlas import MAX_CANDIDATES, Atlas
 from edgeslam_torch.atlas.place_recognition import revisit_candidates
-from edgeslam_torch.frontend.aperture import are_corners
-from edgeslam_torch.frontend.image import as_grey, colours_at
+from edgeslam_torch.frontend.image import colours_at
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.depth_prior import UNKNOWN_DEPTH_LOG, sample
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
@@ -111,10 +109,7 @@ class Starting:
         colour = colours_at(keyframe.image, view.features.uv)
         self._seen.clear()
         self._seen.append((frame.index, view))
-        corner = self._corners(frame, view)
-        self._attempt = Bootstrap(
-            slam_map, system.tracker, self.config, keyframe, guess, colour, system.config.seed, corner
-        )
+        self._attempt = Bootstrap(slam_map, system.tracker, self.config, keyframe, guess, colour, system.config.seed)
         system.begin_submap(keyframe)
         slam_map.remove_empty_keyframes()
         return Step(Event.BEGUN, keyframe, FrameStatus.STARTING, reason, is_keyframe=True)
@@ -157,7 +152,7 @@ class Starting:
             return self.begin(frame, view, "lost sight of the first keyframe before parallax sufficed")
         self.system.motion.move(frame.stamp_s, track.T_c_w)
         with self.system.timed("initialisation"):
-            two_view = attempt.two_views(frame.index, view, track, self._corners(frame, view))
+            two_view = attempt.two_views(frame.index, view, track)
             leaving = track.inliers < ADOPT_SHARE * attempt.max_matched and attempt.reference.depth is not None
             if two_view.ok and not leaving:
                 two_view = attempt.confirm(view, two_view)
@@ -222,12 +217,6 @@ class Starting:
         return Step(
             Event.MAP_READY, keyframe, FrameStatus.INITIALISED, reason, track, two_view.parallax_rad, is_keyframe=True
         )
-
-    def _corners(self, frame: Frame, view: View) -> NDArray[np.bool_]:
-        """Which keypoints of a frame are corners ``(N,)``; the others lie on edges."""
-        grey = as_grey(frame.image) if frame.grey is None else frame.grey
-        on_lens = self.system.camera.distort_points(view.features.uv)
-        return are_corners(grey, on_lens, 1.0 / view.inv_sigma)
 
     def _guess_depth(self, keyframe: Keyframe) -> FloatArray:
         """Predicted depth [map units] of every keypoint and its log sigma, ``(N, 2)``."""

@@ -4,7 +4,6 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeslam_torch.config import InitialisationConfig
 from edgeslam_torch.geometry import se3
@@ -89,7 +88,6 @@ class Bootstrap:
         guess: FloatArray,
         colour: np.ndarray,
         seed: int = 0,
-        corner: NDArray[np.bool_] | None = None,
     ) -> None:
         """Start with a map of predicted depths.
 
@@ -101,14 +99,12 @@ class Bootstrap:
             guess: Depth of its keypoints [map units] and log standard deviation ``(N, 2)``.
             colour: RGB of its keypoints ``(N, 3)``.
             seed: Seed of the essential matrix's random samples.
-            corner: Mask ``(N,)`` of its keypoints that are corners, see `are_corners`; None: all.
         """
         self.map = slam_map
         self.tracker = tracker
         self.config = config
         self.seed = seed
         self.reference = reference
-        self.corner = np.ones(len(guess), dtype=bool) if corner is None else corner
         self.guess_depth = guess_depth = guess[:, 0]
         self.max_matched = 0
         """Maximum number of inliers so far, of frames that differ from the reference."""
@@ -148,7 +144,7 @@ class Bootstrap:
         keypoint_of_anchor[self.reference.anchor] = np.arange(len(self.reference.anchor))
         return keypoint_of_anchor[track.matched_anchor]
 
-    def two_views(self, frame_index: int, view: View, track: Track, corner: NDArray[np.bool_] | None = None) -> TwoView:
+    def two_views(self, frame_index: int, view: View, track: Track) -> TwoView:
         """Store the frame's matches and try to triangulate those of corners with the reference.
 
         Keypoints on edges slide along them (aperture problem): hundreds on a panelled wall fit an essential matrix of a
@@ -158,7 +154,6 @@ class Bootstrap:
             frame_index: Index of the frame.
             view: Its features.
             track: Its matches.
-            corner: Mask ``(N,)`` of its keypoints that are corners; None: all.
         """
         reference_keypoint = self._reference_keypoints(track)
         self.views.append(
@@ -171,7 +166,7 @@ class Bootstrap:
             )
         )
         keypoint = track.matched_keypoint
-        both = self.corner[reference_keypoint] & (True if corner is None else corner[keypoint])
+        both = self.reference.features.on_corners(reference_keypoint) & view.features.on_corners(keypoint)
         matches = reference_keypoint[both], keypoint[both]
         found = self._two_view_map(view, *matches, self.seed)
         if found.ok and len(self.views) == 1:
