@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy import ndimage
 
-from edgeslam_torch.navigation.corridor.trail import SAME_M, STEP_M, aside
+from edgeslam_torch.navigation.corridor.trail import SAME_M, aside
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.openings.exit_tracker import SAME_COS
 from edgeslam_torch.types import FloatArray
@@ -15,7 +15,11 @@ _BERTH_M = 0.55
 SMEARED_BERTH_M = 0.4
 """The same for side corridors, whose mouths appear narrowed by depth errors, if nothing else leads on."""
 _ARRIVED_M = 0.6
-"""Minimum free distance ahead, and half width of the strip straight ahead."""
+"""Minimum free distance ahead."""
+_STRIP_M = 0.6
+"""Half width of the strip straight ahead."""
+_NEAREST_M = 1.0
+"""Maximum distance from the drone to the space that it follows."""
 _NARROW_M = 0.3
 """Clearance straight ahead, where underestimated depth may narrow the corridor to a door's width."""
 _WALL_M, _ABREAST_M = 2.0, 0.5
@@ -36,7 +40,7 @@ def is_ahead(p_w: FloatArray, here_w: FloatArray, axis: FloatArray) -> np.ndarra
 
 def straight(layer: Layer, here_w: FloatArray, axis: FloatArray, before_m: float) -> np.ndarray:
     """Reachable cells ``(N, 2)`` straight ahead, nearer than ``before_m``, also through narrow space."""
-    cells = _part(layer, here_w, _NARROW_M, lambda p_w: np.abs(aside(p_w - here_w, axis)) < _ARRIVED_M)
+    cells = _part(layer, here_w, _NARROW_M, lambda p_w: np.abs(aside(p_w - here_w, axis)) < _STRIP_M)
     along = (layer.centres(cells) - here_w) @ axis
     return cells[(along > _ARRIVED_M) & (along < before_m)]
 
@@ -71,7 +75,7 @@ def _part(
         return cells
     away = np.linalg.norm(layer.centres(cells) - here_w, axis=1)
     nearest = int(np.argmin(away))
-    if away[nearest] > STEP_M:
+    if away[nearest] > _NEAREST_M:
         return cells[:0]
     open_ = np.zeros(layer.free.shape, dtype=bool)
     open_[tuple(cells.T)] = True

@@ -14,8 +14,8 @@ from edgeslam_torch.types import FloatArray
 
 PASSED_M = 0.5 * WIDEST_M
 """Points within this distance of the path flown are in the same corridor."""
-STEP_M = 1.0
-"""Distance over which the direction of flight is measured, and at most to the free space that is followed."""
+_HEADING_M = 1.0
+"""Distance over which the direction of flight is measured."""
 _ALONG_WALLS_COS = math.cos(math.radians(25.0))
 """Maximum angle between the direction of flight and the walls while avoiding obstacles."""
 _DEAD_END_M = 1.5
@@ -54,9 +54,9 @@ class Trail:
         steps = state.p_w[:2] - places_w
         away = np.linalg.norm(steps, axis=1)
         last = int(np.argmin(away))
-        if away[last] < STEP_M:
+        if away[last] < _HEADING_M:
             return
-        shares = np.linspace(0.0, 1.0, int(away[last] / STEP_M) + 1)[1:]
+        shares = np.linspace(0.0, 1.0, int(away[last] / _HEADING_M) + 1)[1:]
         self.heading_w = steps[last] / away[last]
         self._places.add(state.views, places_w[last] + shares[:, None] * steps[last])
 
