@@ -117,7 +117,7 @@ def contradiction(network: DepthModule, metadata: Metadata, folder: DepthFolder)
     network.eval()
     views = folder.views
     orders, ratios = [], []
-    compared = range(0, len(views), math.ceil(len(views) / COMPARED))
+    compared = range(0, len(views), max(1, math.ceil(len(views) / COMPARED)))
     for view in (views[i] for i in compared):
         depth_m, sigma_log = predict_metres(network, metadata, view)
         known = (view.depth_m > 0) & (depth_m > 0)
