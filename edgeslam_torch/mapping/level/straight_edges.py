@@ -59,8 +59,9 @@ _BUILT_RAD = math.radians(1.5)
 _DEPTH_RAD = math.radians(2.0)
 """Common error of directions derived from depths."""
 _PIVOT = 0.015
-"""Distance from the camera of the point about which a map takes it to turn, relative to the depth. Depths and their
-common tilt are as wrong as this is large beside the camera's motion."""
+"""Distance from the camera of the point about which a map takes it to turn, relative to the depth: that of
+`noise.MAP_PIVOT_M` in a room, in maps without metres. Depths and their common tilt are as wrong as this is large beside
+the camera's motion."""
 _CIRCLES_TELL = 5.0
 """Weight of segments along the vertical relative to those across it."""
 _BLOCKS = 4
