@@ -81,6 +81,10 @@ class FlightController:
         """Hover, overriding the planner, until released; for an operator at the keyboard."""
         self._hold = hold
 
+    def before_take_off(self) -> None:
+        """Drop a landing that was ordered on the ground; one that is ordered during the take-off counts."""
+        self._land_because = ""
+
     def land(self, why: str) -> None:
         """Land instead of following the planner, and return at once; callable from a signal handler."""
         self._land_because = self._land_because or why

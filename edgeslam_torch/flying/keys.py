@@ -17,7 +17,7 @@ def keys(hold: Callable[[bool], None], land: Callable[[], None]) -> Iterator[boo
 
     Args:
         hold: Called with whether to hover.
-        land: Called once to land.
+        land: Called to land.
     """
     if os.name != "posix" or not sys.stdin.isatty():
         yield False
@@ -40,7 +40,7 @@ def keys(hold: Callable[[bool], None], land: Callable[[], None]) -> Iterator[boo
 
 
 def listen(number: int, stopping: threading.Event, hold: Callable[[bool], None], land: Callable[[], None]) -> None:
-    """Read keys from a file descriptor until stopped, end of file, or landing."""
+    """Read keys from a file descriptor until stopped or end of file."""
     held = False
     while not stopping.is_set():
         if not select.select([number], [], [], _POLL_S)[0]:
@@ -53,4 +53,3 @@ def listen(number: int, stopping: threading.Event, hold: Callable[[bool], None],
             hold(held)
         elif key in LAND:
             land()
-            return

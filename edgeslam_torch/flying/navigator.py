@@ -131,6 +131,7 @@ class Navigator:
         if self.vehicle.over:
             raise FlightRefused(f"this flight has ended ({self.vehicle.over}); open a new navigator for the next one")
         check_fit(self.allow_motion, self.vehicle.battery, self.limits, self.vehicle.camera.source.startswith(GUESS))
+        self.flight_controller.before_take_off()
         self.vehicle.take_off()
         return self.fly(TakeOff(self.limits.height_m))
 

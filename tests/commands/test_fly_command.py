@@ -36,10 +36,10 @@ def test_what_is_wrong_is_said_in_one_line(arguments, capsys):
 def test_keys_hold_let_go_and_land():
     read, write = os.pipe()
     told = []
-    os.write(write, b"x  l ")
+    os.write(write, b"x  lq")
+    os.close(write)
     try:
         listen(read, threading.Event(), told.append, lambda: told.append("land"))
     finally:
         os.close(read)
-        os.close(write)
-    assert told == [True, False, "land"]
+    assert told == [True, False, "land", "land"], "one that was pressed on the ground does not count"

@@ -112,6 +112,19 @@ def test_an_outcome_says_what_it_rests_on(tracked, apart_m, reason):
     assert nav.explore(60.0).reason == NO_WAY.reason, "a failure rests on nothing"
 
 
+def test_a_landing_that_was_ordered_on_the_ground_is_none_of_the_next_flight():
+    nav = navigator()
+    nav.flight_controller.land("by the keyboard")
+    assert nav.take_off().reached and nav.vehicle.flying
+
+
+def test_a_landing_that_is_ordered_during_the_take_off_is_obeyed():
+    nav = navigator()
+    rise = nav.vehicle.take_off
+    nav.vehicle.take_off = lambda: (rise(), nav.flight_controller.land("by the keyboard"))
+    assert not nav.take_off().reached and nav.vehicle.over == "by the keyboard"
+
+
 @pytest.mark.slow
 def test_there_and_back_with_outcomes():
     with navigator() as nav:
