@@ -15,10 +15,10 @@ JUDGE_ARGS ?=
 STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help install demo kernels test test-slow mutation lint docs results notebooks wheel clean
+.PHONY: help install demo kernels test test-all mutation lint docs results notebooks wheel clean
 
 help:
-	@echo "make demo | test | test-slow | mutation | lint | docs | results | wheel | clean"
+	@echo "make demo | test | test-all | mutation | lint | docs | results | wheel | clean"
 
 install: $(STAMP)
 
@@ -40,19 +40,22 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 
 # Loops are compiled once and cached, before both processes of the tests would compile them at the same time.
 COMPILE := import importlib, sys; from edgeslam_torch.compiled import compile_all; \
 	[importlib.import_module(path[:-3].replace("/", ".")) for path in sys.argv[1:]]; compile_all()
-kernels: $(STAMP)
-	@grep -rl --include='*.py' 'compiled import compiled' edgeslam_torch | sort | xargs -n 3 -P 2 $(BIN)/python -c '$(COMPILE)'
+LOOPS := $(shell grep -rl --include='*.py' 'compiled import compiled' edgeslam_torch)
+KERNELS := $(VENV)/.compiled
+kernels: $(KERNELS)
+$(KERNELS): $(STAMP) $(LOOPS)
+	@printf '%s\n' $(LOOPS) | sort | xargs -n 3 -P 2 $(BIN)/python -c '$(COMPILE)'
+	@touch $@
 
 # The examples in docstrings are tests too.
-test: $(STAMP) kernels
-	$(PYTEST) --doctest-modules --doctest-ignore-import-errors tests edgeslam_torch $(PYTEST_ARGS)
+TESTED := --doctest-modules tests $$(grep -Rl --include='*.py' '>>> ' edgeslam_torch)
+test: $(STAMP) $(KERNELS)
+	$(PYTEST) $(TESTED) $(PYTEST_ARGS)
 
-# What measures time, or must keep up with a flying drone, has the machine to itself. 5: nothing was selected.
-# Only files that say so are loaded: that of all takes ten seconds a process.
-MARKED := grep -rl --include='test_*.py' mark
-test-slow: $(STAMP)
-	$(PYTEST) -m "slow and not alone" $$($(MARKED).slow tests) $(PYTEST_ARGS) || test $$? = 5
-	$(PYTEST) -n 0 -m "slow and alone" $$($(MARKED).alone tests) $(PYTEST_ARGS) || test $$? = 5
+# What measures time, or must keep up with a flying drone, has the machine to itself; only files that say so are loaded.
+test-all: $(STAMP) $(KERNELS)
+	$(PYTEST) -m "not alone" $(TESTED) $(PYTEST_ARGS)
+	$(PYTEST) -n 0 -m alone $$(grep -rl --include='test_*.py' mark.alone tests) $(PYTEST_ARGS)
 
 # mutmut changes the code in one place at a time and runs the tests that come by: what none of them notices is listed with
 # its change. By default every tenth change of ten files, against the fast suite; another tenth and other files each week.
@@ -102,5 +105,5 @@ notebooks: $(STAMP)
 	cd examples/notebooks && ../../$(BIN)/jupyter execute --inplace *.ipynb
 
 clean:
-	rm -rf dist build site runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf dist build site runs $(KERNELS) .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +

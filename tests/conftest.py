@@ -31,6 +31,22 @@ def pytest_configure(config):
     gc.disable()  # loading torch and a thousand modules makes no garbage
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config, items):
+    """Each process that shares the tests begins with slow ones and ends with short ones, which others can take over."""
+    processes = getattr(config, "workerinput", {}).get("workercount", 1)
+    slow = [item for item in items if item.get_closest_marker("slow")]
+    files = list(dict.fromkeys(item.path for item in slow))
+    rest = [item for item in items if not item.get_closest_marker("slow")]
+    in_order, total = [], len(items)
+    for k in range(processes):
+        in_order += [item for item in slow if files.index(item.path) % processes == k]
+        count = max(0, total * (k + 1) // processes - len(in_order))
+        in_order += rest[:count]
+        rest = rest[count:]
+    items[:] = in_order + rest
+
+
 def pytest_collection_finish():
     """What is loaded stays: the collector need not look at it again and again."""
     gc.freeze()
