@@ -72,6 +72,7 @@ def test_second_flight_is_in_the_map_of_the_first_at_once_and_in_its_metres(tmp_
     assert outputs[-1].metric
 
 
+@pytest.mark.slow
 def test_a_flight_elsewhere_has_a_map_of_its_own_and_both_are_saved():
     slam, outputs = second_flight(elsewhere().frames)
     assert {o.piece for o in outputs} == {1}

@@ -104,6 +104,7 @@ def imported_names():
     return {name.name for node in found if (node.module or "").startswith("edgeslam_torch") for name in node.names}
 
 
+@pytest.mark.slow
 def test_every_setting_has_its_default_and_its_reason():
     rows = re.findall(r"^\| `(\w+)` \| `([^`]+)`[^|]* \| (.+) \|$", reference.settings_page(), re.MULTILINE)
     config = tomllib.loads(to_toml(SlamConfig()))

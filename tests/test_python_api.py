@@ -87,7 +87,9 @@ def test_steps_pair_each_frame_with_the_telemetry_since_the_last(tmp_path, write
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="counts threads by /proc")
-@pytest.mark.parametrize(("wanted", "threads"), [({}, 1), ({"OPENBLAS_NUM_THREADS": "2"}, 2)])
+@pytest.mark.parametrize(
+    ("wanted", "threads"), [({}, 1), pytest.param({"OPENBLAS_NUM_THREADS": "2"}, 2, marks=pytest.mark.slow)]
+)
 def test_linear_algebra_takes_one_thread_unless_the_user_wants_more(wanted, threads):
     code = "import edgeslam_torch.slam, os; print(len(os.listdir('/proc/self/task')))"
     environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")} | wanted

@@ -225,7 +225,7 @@ def test_the_world_is_upright_although_attitude_arrives_late():
     assert np.linalg.norm(jump) < 0.06, "about the camera: two steps at most"
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("mirrored", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_final_world_is_as_level_as_the_attitude_is_right(mirrored):
     """The first attitude is 20 degrees off, the others are not. A mirrored one is not what levels the final world."""
     film_ = film(stairs_world(), CAMERA, sideways(40, 0.03, turn_rad=0.02), step_s=1 / 15)
@@ -247,6 +247,7 @@ def test_the_final_world_is_as_level_as_the_attitude_is_right(mirrored):
         assert off.max() < 2.0 * slam.up.sigma_rad < np.deg2rad(10.0), "the delay is not known yet"
 
 
+@pytest.mark.slow
 def test_an_attitude_that_comes_in_flight_and_has_proven_nothing_does_not_turn_the_world():
     """It may be of another moment, or of another flight: the first one that it tells is 20 degrees off."""
     film_ = panels()
@@ -460,6 +461,7 @@ def relative(depth):
     return seen
 
 
+@pytest.mark.slow
 def test_relative_depth_serves_the_map_and_gives_no_metres():
     slam, outputs = go(panels().frames, relative(panels().depth_function()))
     _, T_w_c = slam.trajectory()

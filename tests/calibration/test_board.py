@@ -135,6 +135,7 @@ def test_command_refuses_in_one_line(arguments, tmp_path, capsys):
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_a_real_tello_is_calibrated_as_ros_did(data_dir):
     """26 of the 101 pictures that ost.yaml rests on; the issue allows 1 %, 8 px, 0.4 px and a minute."""

@@ -13,6 +13,7 @@ from edgeslam_torch.readers.source import open_source
 SMALL = ["--world", "corridor", "--rate", "5", "--width", "160", "--seed", "3", "--record-only"]
 
 
+@pytest.mark.slow
 def test_recordings_have_different_places_can_be_run_and_are_not_made_again(tmp_path, capsys):
     def first_images(flights):
         assert main(["demo", "--out", str(tmp_path), "--flights", flights, "--duration", "1", *SMALL]) == 0

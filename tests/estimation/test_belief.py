@@ -54,6 +54,7 @@ def test_limits_are_sigmas_of_the_difference():
     assert contradict(one, ScaleBelief(-0.152, 0.04, "height"))
 
 
+@pytest.mark.slow
 def test_truth_stays_inside_two_sigmas_when_networks_lie(rng):
     """One network in five is wrong by up to four times; averaging would drag the scale along in most of these."""
     inside, averaged, count = 0, 0, 1000

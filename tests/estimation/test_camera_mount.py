@@ -62,6 +62,7 @@ def test_a_short_turn_corrects_less_than_a_whole_one(rng):
     assert 0.0 < corrected[0] < 1.0 < corrected[1] < corrected[2] < 4.0
 
 
+@pytest.mark.slow
 def test_up_and_scale_of_a_camera_that_leans(rng, replay, swinging):
     """Five degrees further down than was said, turning by a half circle: left out, up leans by nearly five degrees."""
     base = swinging(40.0)

@@ -139,6 +139,7 @@ def test_the_present_pose_makes_up_for_the_delay(rng, swinging):
     assert np.median(slow) < 0.12
 
 
+@pytest.mark.slow
 def test_the_printed_filter_stays_selectable_and_says_something_else(rng, swinging):
     answers = []
     for literal in (False, True):
@@ -239,6 +240,7 @@ def jittery(rng, jitter_m, drift, jitter):
     return state.p_w[0] - 0.3 * stamps[-1], np.sqrt(state.covariance[0, 0])
 
 
+@pytest.mark.slow
 def test_jitter_of_visual_poses_is_counted_once(rng):
     """Poses with 1 cm of jitter tell the way to a centimetre however many there are; increments would lose it."""
     once = np.array([jittery(rng, 0.01, PoseSigma(0.0, 1e-4), PoseSigma(0.01, 1e-3)) for _ in range(25)])
@@ -249,7 +251,8 @@ def test_jitter_of_visual_poses_is_counted_once(rng):
     assert np.mean(once[:, 0] ** 2) < np.mean(twice[:, 0] ** 2)
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
 def test_the_delay_is_right_whatever_the_phase_of_the_packets(seed):
     """Frames at 20 Hz and state messages at 10 Hz in step: readings interpolated half-way are less noisy, and a search
     that does not know it prefers delays between the steps (0.36 or 0.44 s for 0.40)."""

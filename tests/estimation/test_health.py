@@ -23,6 +23,7 @@ def test_disagreement_counts_sigmas_of_the_difference():
     assert disagreement([one]) == disagreement([]) == 0.0
 
 
+@pytest.mark.slow
 def test_health_of_a_flight_and_of_its_silence(rng, swinging, replay):
     motion = swinging(20.0)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=TelemetryFaults(video_delay_s=0.4)).samples()

@@ -51,6 +51,7 @@ def test_turning_does_not_change_the_scale_from_velocities(rng, looking_round, r
     assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.02)
 
 
+@pytest.mark.slow
 def test_nodding_is_no_climb(rng, swinging, replay):
     """Up and down by 30 cm while the nose goes up and down by 15 degrees: the camera rises by 12 cm of that more."""
     motion = swinging(24.0)
@@ -60,6 +61,7 @@ def test_nodding_is_no_climb(rng, swinging, replay):
     assert fusion.statistics()["scale height"] == pytest.approx(gauge.scale, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_camera_that_turns_while_it_is_lost_is_predicted_on_its_arc(rng, looking_round, replay):
     """0.8 s without an image, 30 degrees: 27 cm of arc that no velocity tells of."""
     fusion, gauge = fused(rng, looking_round, replay, until_s=19.0)

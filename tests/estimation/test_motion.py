@@ -115,7 +115,7 @@ def take_off(motion, t):
 
 
 @pytest.mark.parametrize(
-    ("delay_s", "latest_s"), [(0.5, 2.8), pytest.param(0.3, 5.8, marks=pytest.mark.slow), (0.75, 5.8)]
+    ("delay_s", "latest_s"), [(0.5, 2.8), *(pytest.param(s, 5.8, marks=pytest.mark.slow) for s in (0.3, 0.75))]
 )
 def test_climb_gives_the_scale_within_its_sigma(fused, swinging, replay, delay_s, latest_s):
     """After four half seconds; where the delay is not the initial one heights are off by a tenth, velocities do not
@@ -133,6 +133,7 @@ def test_climb_gives_the_scale_within_its_sigma(fused, swinging, replay, delay_s
         assert abs(z_of(scale, gauge)) < 2.5
 
 
+@pytest.mark.slow
 def test_frames_that_a_map_began_with_are_as_good_as_tracked_ones(fused, swinging, replay):
     """Of a climb whose first 1.2 s have no map yet, the scale is told when it would have been with one."""
     motion, known_s = take_off(swinging(1.0), np.arange(0.0, 5.0, 0.05)), {}
@@ -170,6 +171,7 @@ def test_height_changes_alone_tell_the_scale_of_a_climb(fused, swinging):
     assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.04)
 
 
+@pytest.mark.slow
 def test_pure_rotation_discards_the_scale_of_a_climb(fused, swinging, replay):
     """A quarter of a metre up in seven seconds, of which velocities tell nothing; then round on the spot: the map in
     view shares nothing any more with what the climb told. A drone that glances to the side keeps them."""
@@ -195,6 +197,7 @@ def test_small_height_changes_give_no_scale(fused, swinging):
 # --- drift and hover ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_while_flying_the_scale_is_the_present_one(fused, swinging, replay):
     """A map whose first four seconds are a quarter too short."""
     motion, off, z = swinging(14.0, 10.0), [], []
@@ -319,7 +322,7 @@ def test_lost_frames_and_poses_that_are_no_number_are_no_evidence(fused, swingin
     assert fusion.statistics()["visual not tracked"] == 110
 
 
-@pytest.mark.parametrize("gap_s", [0.05, 1.0])
+@pytest.mark.parametrize("gap_s", [pytest.param(0.05, marks=pytest.mark.slow), 1.0])
 def test_prediction_bridges_lost_vision(fused, swinging, replay, gap_s):
     """Compared with a constant pose: what telemetry adds while video is missing, every two seconds from 8 s on."""
     errors, still = [], []

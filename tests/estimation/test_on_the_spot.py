@@ -66,7 +66,14 @@ def torn(rng):
     return np.where(STAMPS_S[1:] < 3.0, 7.0, 1.0)
 
 
-@pytest.mark.parametrize(("grow", "metric"), [(as_it_is, True), (by_views, True), (torn, False)])
+@pytest.mark.parametrize(
+    ("grow", "metric"),
+    [
+        (as_it_is, True),
+        pytest.param(by_views, True, marks=pytest.mark.slow),
+        pytest.param(torn, False, marks=pytest.mark.slow),
+    ],
+)
 def test_stated_sigma_of_rotation_in_place_covers_the_truth(grow, metric):
     told = []
     for seed in range(4):

@@ -360,6 +360,7 @@ def test_velocities_in_the_wrong_unit_are_named_and_the_scale_covers_them(told_o
         assert (model.velocity, model.height) == (False, "tof"), "nor do they pull at the map in its refinement"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("random", [True, False])
 def test_heights_that_do_not_climb_with_the_images_are_not_used(told_of, swinging, replay, random):
     def spoil(rng, samples, motion):

@@ -95,7 +95,7 @@ def errors(flight, outputs):
     return np.degrees(np.linalg.norm(se3.log(off)[3:])), float(np.linalg.norm(off[:3, 3]))
 
 
-@pytest.mark.parametrize("turns", [True, False])
+@pytest.mark.parametrize("turns", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_prediction_prevents_a_mismatch_on_a_repetitive_wall(turns):
     flight = wallpaper() if turns else passing()
     held, alone = (errors(flight, flown(flight, how)) for how in (true_motion(flight), no_filter))

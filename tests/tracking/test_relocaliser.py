@@ -58,6 +58,7 @@ def pose_error(T_c_w, truth):
     return np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])
 
 
+@pytest.mark.slow
 def test_a_duplicate_poster_is_rejected(points, rng):
     """As in the simulated room that was 60 cm wrong: 51 inliers in one corner, of a thousand to be seen."""
     tracker = tracker_of(points)
@@ -85,6 +86,7 @@ def test_a_single_poster_is_rejected(points, rng):
         assert relocaliser.find(index, view, points.keyframes, SOMEWHERE) is None
 
 
+@pytest.mark.slow
 def test_a_repeated_pattern_is_rejected(points, rng):
     """One keypoint of twelve agrees, all over the image: doors that repeat do as well in the wrong place."""
     tracker = tracker_of(points)

@@ -37,6 +37,7 @@ def test_pairs_show_the_points_where_they_are(example, run_folder):
     assert float(sample["K"][0, 0]) == pytest.approx(CAMERA.fx)
 
 
+@pytest.mark.slow
 def test_loop_trains_and_writes_weights(example, run_folder, tmp_path, monkeypatch, capsys):
     network = narrow_fastdepth()
     save_checkpoint(network, RUNS, tmp_path / "start.safetensors")

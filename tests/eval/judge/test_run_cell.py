@@ -64,6 +64,7 @@ def test_recording_is_run_and_judged(judged):
     assert figures["cpu_ms"] > 0 and figures["memory_mb"] > 0
 
 
+@pytest.mark.slow
 def test_variant_is_judged_against_the_same_truth(recording, tmp_path):
     result = run(tmp_path, Cell("stairs/half_rate", 0, str(recording), "half_rate"))
     assert result["figures"]["frames"] == 18
@@ -158,6 +159,7 @@ def test_second_flight_is_in_the_map_of_the_first_and_judged_against_it(recordin
     assert 0.0 <= figures["metres_off"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_further_flight_has_another_path_through_the_same_world(tmp_path, monkeypatch):
     monkeypatch.setitem(COURSES, "corridor", replace(COURSES["corridor"], seconds=0.2))
     flights.record_once(tmp_path / "again", "corridor", 3, 1)

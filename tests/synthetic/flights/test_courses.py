@@ -87,6 +87,7 @@ def test_first_second_goes_nowhere_and_the_rest_is_a_flight(name, min_deg, max_d
     assert path_m(flight) > 6.0
 
 
+@pytest.mark.slow
 def test_a_flight_with_an_imu_is_read_with_its_mount(tmp_path):
     settings = demo.DemoSettings("corridor", seconds=1.0, rate_hz=8.0, seed=4, width=80, height=60, imu=True)
     flight = demo.record(tmp_path / "demo", settings).flight
@@ -109,6 +110,7 @@ def test_a_flight_along_a_rectangle_turns_at_its_corners():
     assert np.degrees(np.percentile(off, 95)) < 35.0, "it looks where it flies"
 
 
+@pytest.mark.slow
 def test_low_light_is_dark_and_noisy(rng):
     world, flight = flight_of("low_light")
     view = render(world, simulated_camera(160, 120), flight.T_w_c[0])

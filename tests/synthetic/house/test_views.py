@@ -1,6 +1,7 @@
 """Poses, and random rooms to train depth on."""
 
 import numpy as np
+import pytest
 
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.render import render
@@ -16,6 +17,7 @@ def test_pose_looks_along_its_yaw_and_tilt():
     assert T_w_c[2, 1] < 0  # image down is world down
 
 
+@pytest.mark.slow
 def test_random_rooms_are_closed_sensible_textured_and_the_same_for_a_seed():
     views = []
     for seed in (5, 6):

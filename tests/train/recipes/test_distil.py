@@ -83,6 +83,7 @@ def test_labels_are_measured_where_they_can_be_and_the_teachers_elsewhere(sequen
         assert np.median(off) < 0.03 and np.mean(off < 0.1) > 0.8
 
 
+@pytest.mark.slow
 def test_a_teacher_whose_metres_are_others_is_warned_of(sequence, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(teach, "MOST", 2)
     for times, warned in ((1.0, False), (12.0, True)):
@@ -90,7 +91,7 @@ def test_a_teacher_whose_metres_are_others_is_warned_of(sequence, tmp_path, monk
         assert ("times the network's" in caplog.text) == warned
 
 
-@pytest.mark.parametrize("variant", [Variant.PRUNED, Variant.NNCONV5DW])
+@pytest.mark.parametrize("variant", [Variant.PRUNED, pytest.param(Variant.NNCONV5DW, marks=pytest.mark.slow)])
 def test_student_begins_with_what_fits_of_the_shipped_weights(variant):
     student, metadata = new_student(variant)
     shipped = load_checkpoint(None)[0]

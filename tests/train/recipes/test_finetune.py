@@ -123,6 +123,7 @@ def test_other_data_into_the_same_folder_is_refused_and_nothing_changes(finetune
     assert contents(tmp_path / "out") == before
 
 
+@pytest.mark.slow
 def test_data_that_changed_on_disk_is_refused(finetune, recordings, tmp_path):
     folder = shutil.copytree(recordings / "kitchen", tmp_path / "kitchen")
     finetune(str(folder), steps=1)

@@ -78,6 +78,7 @@ def test_folder_of_a_batch_stands_for_its_finished_flights(run_folder, tmp_path)
         assert (item.kind, item.path) == ("run", batch / "flights" / "run")
 
 
+@pytest.mark.slow
 def test_pairs_alone_leave_nothing_to_validate_on_and_that_is_said(run_folder, tmp_path, capsys):
     assert command.main(arguments(tmp_path, run_folder, "--from-runs", "pairs")) == 0
     assert "weights after 3 steps, not validated" in capsys.readouterr().out

@@ -17,6 +17,7 @@ from edgeslam_torch.train.views.datasets import load_depth_folder
 METADATA = Metadata(input_height=32, input_width=64, focal_px=60.0)
 
 
+@pytest.mark.slow
 def test_a_job_ends_with_the_mean_of_the_weights_before_and_after(tmp_path, monkeypatch):
     views = load_depth_folder(write_folder(tmp_path / "hall", 4)).views
     monkeypatch.setattr(weights, "render_files", lambda *_: ["first", "second"])
