@@ -171,6 +171,7 @@ def test_junctions_of_two_views_are_paired_by_place_and_direction():
     assert seen_cosines(turned, found).isnan().all(), "arms the other way"
 
 
+@pytest.mark.slow
 def test_teacher_measures_what_the_network_does_not_know(sequence, tmp_path, monkeypatch):
     monkeypatch.setattr(teacher, "WIDTH", 100)  # of views that are wider
     network = narrow_fastdepth()
@@ -191,7 +192,7 @@ def test_finetune_command_runs_the_slam_on_a_flight(tmp_path, capsys):
     from edgeslam_torch.demo import DemoSettings, record
     from edgeslam_torch.models.checkpoint import load_checkpoint
 
-    record(tmp_path / "flight", DemoSettings(seconds=6.0, rate_hz=12.0, width=320, height=240))
+    record(tmp_path / "flight", DemoSettings(seconds=3.0, rate_hz=12.0, width=320, height=240))
     out = tmp_path / "out"
     given = [str(tmp_path / "flight"), "--ignore-depth", "--out", str(out)]
     assert main(["finetune", *given, "--steps", "2", "--batch", "2"]) == 0
