@@ -44,7 +44,7 @@ COMPILE := import importlib, sys; from edgeslam_torch.compiled import compile_al
 LOOPS := $(shell grep -rl --include='*.py' 'compiled import compiled' edgeslam_torch)
 KERNELS := $(VENV)/.compiled
 kernels: $(KERNELS)
-$(KERNELS): $(STAMP) $(LOOPS)
+$(KERNELS): $(STAMP) $(LOOPS) $(wildcard edgeslam_torch/compiled/*.py)
 	@printf '%s\n' $(LOOPS) | sort | xargs -n 3 -P 2 $(BIN)/python -c '$(COMPILE)'
 	@touch $@
 

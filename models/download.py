@@ -5,7 +5,6 @@ download is stored beside the file and required of later ones (trust on first us
 """
 
 import hashlib
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,15 +43,6 @@ REMOTES = {
         "mobilenet-nnconv5dw-skipadd-pruned": "pruned, 1.35 M parameters, the paper's final network",
     }.items()
 }
-
-
-def cache_folder() -> Path:
-    """``EDGESLAM_CACHE``, else ``$XDG_CACHE_HOME/edgeslam``, else ``~/.cache/edgeslam``."""
-    given = os.environ.get("EDGESLAM_CACHE")
-    if given:
-        return Path(given).expanduser()
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "edgeslam"
 
 
 @dataclass(frozen=True, slots=True)

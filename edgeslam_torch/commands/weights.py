@@ -48,7 +48,8 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _list(_: argparse.Namespace) -> None:
-    from edgeslam_torch.models.download import REMOTES, cache_folder
+    from edgeslam_torch.compiled.user_cache import cache_folder
+    from edgeslam_torch.models.download import REMOTES
     from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
     from edgeslam_torch.models.record import SHIPPED_WEIGHTS
     from edgeslam_torch.models.weights_file import read_header
@@ -63,8 +64,9 @@ def _list(_: argparse.Namespace) -> None:
 
 
 def _download(args: argparse.Namespace) -> None:
+    from edgeslam_torch.compiled.user_cache import cache_folder
     from edgeslam_torch.files.download import remember, remembered
-    from edgeslam_torch.models.download import REMOTES, cache_folder
+    from edgeslam_torch.models.download import REMOTES
     from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
 
     if args.name in PRESETS:

@@ -13,7 +13,7 @@ import pytest
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.files import download as fetching
 from edgeslam_torch.files.download import KeepEncryption, remember, remembered
-from edgeslam_torch.models.download import cache_folder, download
+from edgeslam_torch.models.download import download
 
 CONTENT = bytes(range(256)) * 700
 
@@ -148,11 +148,3 @@ def test_a_server_without_http_is_one_line(server, tmp_path):
     with pytest.raises(WeightsError, match="download failed") as caught:
         download((f"{server}/garbage",), tmp_path / "w")
     assert "\n" not in str(caught.value)
-
-
-def test_cache_folder_follows_the_environment(monkeypatch, tmp_path):
-    monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path))
-    assert cache_folder() == tmp_path
-    monkeypatch.delenv("EDGESLAM_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "x"))
-    assert cache_folder() == tmp_path / "x" / "edgeslam"

@@ -18,7 +18,7 @@ MIN_ARM_PX = 1e-6
 """Minimum divisor for the length of an arm."""
 
 
-@compiled()
+@compiled("f8[:,:,::1], i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8, f8, b1, UniTuple(f8, 4)")
 def junctions(
     T_j_i: FloatArray,
     view: IntArray,
