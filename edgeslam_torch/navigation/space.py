@@ -70,8 +70,8 @@ class Space:
     _corner: np.ndarray = field(init=False)
     """``(2,)`` int, world cell at the grid's corner."""
     _views: deque[View] = field(init=False)
-    _doubted: int = field(init=False)
-    """Number of oldest views that only free cells (`doubt_solids`)."""
+    _doubted_s: float = field(init=False)
+    """Capture time of the newest view that only frees cells (`doubt_solids`)."""
     _flown: Places = field(init=False)
     _flown_m: list[float] = field(init=False)
     """Radius around each of these points [m]."""
@@ -82,9 +82,8 @@ class Space:
     def __post_init__(self) -> None:
         self._odds = np.zeros((SIDE, SIDE, LEVELS), np.float32)
         self._corner = np.floor(self.centre_w / CELL_M).astype(int) - SIDE // 2
-        self._views = deque(maxlen=MAX_VIEWS)
+        self._views, self._doubted_s = deque(maxlen=MAX_VIEWS), -np.inf
         self._flown, self._flown_m = Places(size=3), []
-        self._doubted = 0
         self._way = np.zeros((SIDE, SIDE), np.uint8)
         self._contacts = Places(size=3)
 
@@ -94,9 +93,7 @@ class Space:
         small = _smaller(view)
         if len(self._views) >= _MAX_SAME and _same_view(self._views[-_MAX_SAME], small):
             self._views[-1] = small
-            self._doubted = min(self._doubted, len(self._views) - 1)
         else:
-            self._doubted -= int(len(self._views) == MAX_VIEWS and self._doubted > 0)
             self._views.append(small)
         self._add(small)
 
@@ -146,7 +143,6 @@ class Space:
     def forget_before(self, seen_s: float) -> None:
         """Drop everything but the views since a time."""
         kept = [view for view in self._views if view.stamp_s >= seen_s]
-        self._doubted = max(0, self._doubted - (len(self._views) - len(kept)))
         self._views = deque(kept, maxlen=MAX_VIEWS)
         self._flown, self._flown_m = Places(size=3), []
         self._contacts = Places(size=3)
@@ -154,15 +150,15 @@ class Space:
 
     def _build(self) -> None:
         self._odds[:], self._way[:] = 0.0, 0
-        for k, view in enumerate(self._views):
-            self._add(view, fills=k >= self._doubted)
+        for view in self._views:
+            self._add(view, fills=view.stamp_s > self._doubted_s)
         for p_w, radius_m in zip(self._flown.p_w, self._flown_m, strict=True):
             self._pass(p_w, radius_m)
 
     def doubt_solids(self) -> None:
         """Reset occupied cells to unknown until they are observed again; free cells and contacts stay."""
         self._odds[self._odds > 0.0] = 0.0
-        self._doubted = len(self._views)
+        self._doubted_s = self._views[-1].stamp_s if self._views else -np.inf
 
     def layer(self, height_m: float, half_m: float) -> Layer:
         """Slice for flight at a height; a cell is free if all cells within ``half_m`` above and below are."""

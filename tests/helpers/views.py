@@ -9,7 +9,7 @@ from edgeslam_torch.navigation.map_views import MapUpdate
 K = np.array([[77.0, 0.0, 39.5], [0.0, 77.0, 29.5], [0.0, 0.0, 1.0]])
 
 
-def facing_a_wall(distance_m=2.0, sigma=0.01, x=0.0, yaw=0.0, height_m=1.15, picture=0):
+def facing_a_wall(distance_m=2.0, sigma=0.01, x=0.0, yaw=0.0, height_m=1.15, picture=0, stamp_s=0.0):
     """A level camera that sees a wall across its optical axis."""
     T = camera_on_body(0.0, 0.0)
     turn = np.eye(4)
@@ -17,7 +17,7 @@ def facing_a_wall(distance_m=2.0, sigma=0.01, x=0.0, yaw=0.0, height_m=1.15, pic
     T = turn @ T
     T[:3, 3] = [x, 0.0, height_m]
     depth = np.full((60, 80), distance_m, np.float32)
-    return View(0.0, depth, np.full((60, 80), sigma, np.float32), K, T, picture)
+    return View(stamp_s, depth, np.full((60, 80), sigma, np.float32), K, T, picture)
 
 
 def longer(ratio):

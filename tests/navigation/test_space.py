@@ -160,7 +160,7 @@ def test_reset_wall_stays_unknown_until_observed_again():
     space.correct(moved(0, there))
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 2.55, 0.05) == (True, False) and not layer.solid.any()
-    layer = seen(space, x=1.0, picture=1)
+    layer = seen(space, x=1.0, picture=1, stamp_s=1.0)
     assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
     space.correct(longer(1.0))
     assert space.layer(1.15, 0.15).solid.any(), "what was seen again stays"
