@@ -53,6 +53,7 @@ def similarity(T_w_c, truth):
     return umeyama(T_w_c[:, :3, 3], truth[:, :3, 3], "sim3")
 
 
+@pytest.mark.slow
 def test_second_flight_is_in_the_map_of_the_first_at_once_and_in_its_metres(tmp_path):
     write_atlas(tmp_path / "room.atlas", first_flight()[1])
     slam, outputs = second_flight(second_film().frames, atlas=read_atlas(tmp_path / "room.atlas"))

@@ -130,6 +130,7 @@ def test_export_refuses_what_makes_no_sense(weights, pictures, tmp_path, words):
     assert not (tmp_path / "x.onnx").exists()
 
 
+@pytest.mark.slow
 def test_weights_list_inspect_convert(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path / "cache"))
     run("weights", "list")

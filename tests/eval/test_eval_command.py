@@ -21,6 +21,7 @@ def run(module, *words):
     return int(module.main(parser.parse_args([str(w) for w in words])))
 
 
+@pytest.mark.slow
 def test_several_runs_give_an_aligned_table(run_folder, tmp_path, capsys):
     truth = run_folder(tmp_path / "a")
     run_folder(tmp_path / "b", scale=1.2)
