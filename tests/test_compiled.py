@@ -13,7 +13,7 @@ import pytest
 
 from edgeslam_torch import compiled as module
 from edgeslam_torch.compiled import build, cache, machine_code
-from edgeslam_torch.compiled.signature import checker
+from edgeslam_torch.compiled.signature import parsed
 from edgeslam_torch.compiled.user_cache import cache_folder
 
 PACKAGE = Path(module.__file__).parent.parent
@@ -222,7 +222,7 @@ def test_a_missing_symbol_is_an_error_and_not_the_end_of_the_process(source):
     ],
 )
 def test_types_of_arguments_are_checked(types, fitting, others):
-    fits = checker(types)
+    fits = parsed(types).fits
     assert all(fits(arguments) for arguments in fitting)
     assert not any(fits(arguments) for arguments in others)
 

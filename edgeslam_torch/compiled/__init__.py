@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from edgeslam_torch.compiled.signature import checker
+from edgeslam_torch.compiled.signature import parsed
 
 logger = logging.getLogger(__name__)
 
@@ -50,14 +50,14 @@ class Loops:
         functools.update_wrapper(self, function)
         self.function = function
         self.types = types
-        self._fit = checker(types) if types else None
+        self._parsed = parsed(types) if types else None
         self._source = Path(function.__code__.co_filename)
         self._call: Callable[..., Any] | None = None
         if types:
             _FILES.setdefault(self._source, {})[function.__qualname__] = self
 
     def __call__(self, *arguments: Any) -> Any:
-        if not (self._fit and self._fit(arguments)):
+        if not (self._parsed and self._parsed.fits(arguments)):
             return self._for_any_types(*arguments)
         if self._call is None:
             _link(self._source)

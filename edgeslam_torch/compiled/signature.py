@@ -1,51 +1,58 @@
-"""Checks of arguments by their types in numba's notation: ``f8, i8[::1], f8[:, ::1], UniTuple(f8, 4)``."""
+"""Types of arguments in numba's notation: ``f8, i8[::1], f8[:, ::1], UniTuple(f8, 4)``."""
 
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 
-class _Type:
-    """``f8``, or with axes the array ``f8[:, ::1]``, in C order."""
+class _Array(NamedTuple):
+    """In C order, aligned and writable."""
 
-    def __init__(self, name: str, python: str = "()", ndim: int | None = None) -> None:
-        self.name, self.python, self.ndim = name, python, ndim
+    dtype: np.dtype[Any]
+    ndim: int
 
-    def __getitem__(self, axes: slice | tuple[slice, ...]) -> "_Type":
-        return _Type(self.name, ndim=len(axes) if isinstance(axes, tuple) else 1)
+    def fits(self, value: Any) -> bool:
+        return type(value) is np.ndarray and (value.dtype, value.ndim) == self and value.flags.carray
+
+
+class _Scalar:
+    """With axes, ``f8[:, ::1]``, an array."""
+
+    def __init__(self, name: str, *accepted: type) -> None:
+        self.name, self.accepted = name, accepted
+
+    def __getitem__(self, axes: slice | tuple[slice, ...]) -> _Array:
+        return _Array(np.dtype(self.name), len(axes) if isinstance(axes, tuple) else 1)
+
+    def fits(self, value: Any) -> bool:
+        return isinstance(value, self.accepted)
+
+
+class Types:
+    """Of all arguments, or of the elements of a tuple."""
+
+    def __init__(self, items: Iterable["_Array | _Scalar | Types"]) -> None:
+        self.items = tuple(items)
+
+    def fits(self, values: Any) -> bool:
+        """Whether values are of these types, as machine code takes for granted."""
+        if type(values) is not tuple or len(values) != len(self.items):
+            return False
+        return all(item.fits(value) for item, value in zip(self.items, values, strict=True))
 
 
 _NOTATION = {
-    "f8": _Type("f8", "(float, int)"),
-    "f4": _Type("f4"),
-    "i8": _Type("i8", "(int, integer)"),
-    "u1": _Type("u1"),
-    "b1": _Type("b1", "(bool, bool_)"),
-    "Tuple": list,
-    "UniTuple": lambda item, count: [item] * count,
-}
-_NAMES = {name: np.dtype(name) for name in _NOTATION if "Tuple" not in name} | {
-    "ndarray": np.ndarray,
-    "integer": np.integer,
-    "bool_": np.bool_,
+    "f8": _Scalar("f8", float, int),
+    "f4": _Scalar("f4"),
+    "i8": _Scalar("i8", int, np.integer),
+    "u1": _Scalar("u1"),
+    "b1": _Scalar("b1", bool, np.bool_),
+    "Tuple": Types,
+    "UniTuple": lambda item, count: Types([item] * count),
 }
 
 
-def checker(types: str) -> Callable[[tuple[Any, ...]], bool]:
-    """Whether arguments are of these types, as machine code takes for granted; written out, as it is called often."""
-    conditions = " and ".join(_conditions("a", list(eval(f"({types},)", _NOTATION))))
-    check: Callable[[tuple[Any, ...]], bool] = eval(f"lambda a: {conditions}", _NAMES)
-    return check
-
-
-def _conditions(value: str, expected: _Type | list[Any]) -> Iterator[str]:
-    if isinstance(expected, list):
-        yield f"type({value}) is tuple and len({value}) == {len(expected)}"
-        for i, item in enumerate(expected):
-            yield from _conditions(f"{value}[{i}]", item)
-    elif expected.ndim is None:
-        yield f"isinstance({value}, {expected.python})"
-    else:
-        yield f"type({value}) is ndarray and {value}.dtype == {expected.name}"
-        yield f"{value}.ndim == {expected.ndim} and {value}.flags.carray"
+def parsed(notation: str) -> Types:
+    """One type or several."""
+    return Types(eval(f"({notation},)", _NOTATION))
