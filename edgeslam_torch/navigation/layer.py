@@ -59,15 +59,16 @@ class Layer:
 
     def clearance_at(self, p_w: FloatArray) -> FloatArray:
         """Clearance [m] at points ``(..., 2)``, interpolated between cells."""
-        return self._at(self.clearance_m, p_w, 0.0)
+        return self.interpolated(self.clearance_m, p_w, 0.0)
 
     def from_solid_at(self, p_w: FloatArray) -> FloatArray:
         """Distance to obstacles [m] at points ``(..., 2)``, interpolated between cells; at most the grid's width."""
         widest = max(self.solid.shape) * self.cell_m
-        return self._at(np.minimum(self.from_solid_m, widest), p_w, widest)
+        return self.interpolated(np.minimum(self.from_solid_m, widest), p_w, widest)
 
-    def _at(self, grid_m: FloatArray, p_w: FloatArray, outside_m: float) -> FloatArray:
+    def interpolated(self, grid: FloatArray, p_w: FloatArray, outside: float) -> FloatArray:
+        """Values of a grid ``(X, Y)`` at points ``(..., 2)``, and ``outside`` of it."""
         at = (np.asarray(p_w) - self.corner_w) / self.cell_m - 0.5
         flat = at.reshape(-1, 2).T
-        value = ndimage.map_coordinates(grid_m, flat, order=1, mode="constant", cval=outside_m)
+        value = ndimage.map_coordinates(grid, flat, order=1, mode="constant", cval=outside)
         return np.asarray(value).reshape(at.shape[:-1])

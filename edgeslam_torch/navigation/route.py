@@ -30,9 +30,11 @@ class CostToGo:
     """``(X, Y)``."""
 
     def at(self, p_w: FloatArray) -> FloatArray:
-        """Cost at points ``(..., 2)``."""
-        cells = self.layer.cells(p_w)
-        return np.asarray(self.cost[cells[..., 0], cells[..., 1]])
+        """Cost at points ``(..., 2)``, interpolated between reachable cells: a slow move ends in the same cell."""
+        reachable = np.isfinite(self.cost)
+        share = self.layer.interpolated(reachable.astype(np.float64), p_w, 0.0)
+        cost = self.layer.interpolated(np.where(reachable, self.cost, 0.0), p_w, 0.0)
+        return np.divide(cost, share, out=np.full_like(cost, np.inf), where=share > 0.0)
 
     def way(self, p_w: FloatArray, length_m: float) -> FloatArray:
         """Cheapest path from a point ``(2,)``: cell centres ``(N, 2)``, up to ``length_m`` or the goal."""
