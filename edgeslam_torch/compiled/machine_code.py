@@ -34,7 +34,11 @@ class MachineCode(NamedTuple):
 
 def processor() -> tuple[str, str, str]:
     """Platform, name and instructions of this processor."""
-    return llvm.get_process_triple(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    try:
+        features = llvm.get_host_cpu_features().flatten()
+    except RuntimeError:  # LLVM does not know them on every platform
+        features = ""
+    return llvm.get_process_triple(), llvm.get_host_cpu_name(), features
 
 
 def target_machine() -> llvm.TargetMachine:
