@@ -110,15 +110,16 @@ class FlowConfig:
 class InitialisationConfig:
     """Two-view initialisation, which replaces the map of the first frame's predicted depths."""
 
-    min_parallax_deg: float = 1.5
-    """Median parallax of the inliers before two views are tried."""
+    min_parallax_deg: float = 0.75
+    """Median angle that no rotation of the camera explains before two views are tried, and minimum parallax of each
+    triangulated anchor."""
     keyframe_gap_s: float = 0.15
     """Minimum time between the intermediate frames that become keyframes after initialisation."""
     max_keyframes: int = 12
     """Maximum number of these frames; each requires an inference of the depth network."""
-    max_direction_sigma: float = 0.08
-    """Standard deviation of the second camera's position relative to the baseline above which initialisation waits:
-    0.08 are 4.6 degrees of direction."""
+    max_direction_sigma: float = 0.15
+    """Standard deviation of the newest camera's position relative to the baseline, under the network's depth as prior,
+    above which initialisation waits: 0.15 are 8.6 degrees of direction. Refinement of the young map corrects more."""
 
     def __post_init__(self) -> None:
         _positive(self, "min_parallax_deg", "keyframe_gap_s", "max_keyframes", "max_direction_sigma")

@@ -42,8 +42,15 @@ def _check(problem: WindowProblem) -> None:
         raise ValueError(f"obs_pose, obs_anchor, uv and inv_sigma must be equally long, got {sorted(lengths)}")
     if len(problem.pose_fixed) != W:
         raise ValueError(f"pose_fixed must have {W} entries, got {len(problem.pose_fixed)}")
-    for name, index, limit in (("obs_pose", problem.obs_pose, W), ("obs_anchor", problem.obs_anchor, A)):
-        if M and (np.min(index) < 0 or np.max(index) >= limit):
+    indices = [("obs_pose", problem.obs_pose, W), ("obs_anchor", problem.obs_anchor, A)]
+    if problem.depth_priors is not None:
+        known = problem.depth_priors
+        lengths = {len(known.anchor), len(known.pose), len(known.inverse_depth), len(known.sigma)}
+        if len(lengths) != 1:
+            raise ValueError(f"the arrays of depth_priors must be equally long, got {sorted(lengths)}")
+        indices += [("depth_priors.pose", known.pose, W), ("depth_priors.anchor", known.anchor, A)]
+    for name, index, limit in indices:
+        if len(index) and (np.min(index) < 0 or np.max(index) >= limit):
             raise ValueError(f"{name} must lie in [0, {limit}), got {np.min(index)}..{np.max(index)}")
 
 

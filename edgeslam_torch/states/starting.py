@@ -28,9 +28,7 @@ from edgeslam_torch.types import FloatArray, Frame, FrameStatus
 
 ADOPT_SHARE = 0.6
 """Share of the maximum number of inliers below which the view has changed, and the depth network's map is adopted,
-since parallax may never come (rotation, climb, hover); two views are not tried any more then, as they rest on the few
-points that are left. A lower share lets two views come first more often, which is better where corners are many and
-wrong on bare boards, where a few random samples decide."""
+since parallax may never come (rotation, climb, hover)."""
 
 LOST_BEFORE_RESTART_S = 0.65
 """Time without a pose after which a new submap is started at the predicted one."""
@@ -151,19 +149,16 @@ class Starting:
             self.system.motion.stop()
             return self.begin(frame, view, "lost sight of the first keyframe before parallax sufficed")
         self.system.motion.move(frame.stamp_s, track.T_c_w)
+        leaving = track.inliers < ADOPT_SHARE * attempt.max_matched and attempt.reference.depth is not None
         with self.system.timed("initialisation"):
-            two_view = attempt.two_views(frame.index, view, track)
-            leaving = track.inliers < ADOPT_SHARE * attempt.max_matched and attempt.reference.depth is not None
-            if two_view.ok and not leaving:
-                two_view = attempt.confirm(view, two_view)
-                self.system.events["initialisations_refused"] += not two_view.ok
-        if leaving:
+            two_view = attempt.two_views(frame.index, view, track, leaving)
+        if two_view.structure is None and leaving:
             with self.system.timed("mapping"), self.system.map.lock:
                 started = attempt.adopt(frame, view, track)
             return self._hand_over(frame, seen, started, DEPTH_MAP, track, two_view)
-        if two_view.ok:
+        if two_view.structure is not None:
             with self.system.timed("mapping"), self.system.map.lock:
-                started = attempt.replace_map(frame, view, two_view, self.lm)
+                started = attempt.replace_map(frame, view, two_view.structure, self.lm)
             return self._hand_over(frame, seen, started, "two views", track, two_view)
         attempt.wait(frame, view, track)
         if track.inliers < HANDOVER_INLIERS:

@@ -60,7 +60,6 @@ class System:
             "lost": 0,
             "relocalised": 0,
             "restarted": 0,
-            "initialisations_refused": 0,
             "contradicted": 0,
         }
     )

@@ -16,10 +16,14 @@ from edgeslam_torch.tracking.initialiser import (
     MIN_POINTS,
     BootstrapView,
     Consensus,
+    Structure,
     TwoView,
+    at_scale_of,
     consensus,
-    poses_of_witnesses,
-    two_view_map,
+    from_essential_matrix,
+    poses_between,
+    rotation_residual,
+    triangulated,
 )
 from edgeslam_torch.tracking.pose_prior import TrackingPrior
 from edgeslam_torch.tracking.tracker import MOTION_RADIUS_PX, Track, Tracker, View
@@ -30,24 +34,16 @@ logger = logging.getLogger(__name__)
 MAX_DIRECTION_SIGMA_ALONE = 0.05
 """As `InitialisationConfig.max_direction_sigma`, 2.9 degrees, without a depth network: a small rotation and a small
 translation move an image in nearly the same way, and only parallax, or predicted depth, resolves the ambiguity."""
-WITNESS_SHARE = 0.6
-"""Minimum share of inliers in the intermediate frames: correct structures reach 0.8 to 0.95 (95 % of correct
-matches)."""
-
-MAX_COST_RATIO = 1.2
-"""Maximum ratio of the costs of two structures that both explain the images: four standard deviations of a chi-square
-with several hundred degrees of freedom."""
-
-OTHER_SAMPLES = 4
-"""Further random samples of the matches that must agree on two views without confirmation by intermediate frames: if
-every second sample disagrees, fifteen of sixteen such views are rejected."""
+LAST_CHANCE_DEG = 0.5
+"""`InitialisationConfig.min_parallax_deg` of the last frame that sees enough of the reference: 4 px at a focal length
+of 500 px. Below it, motion is known to 30 degrees or less, whatever its covariance says."""
 
 SAME_PICTURE_PX = 1.0
 """Median motion of the keypoints up to which a frame shows the reference's view. A static camera, or a repeated image,
 matches all keypoints, which is no standard for later frames."""
 
 AGREEING_SHARE = 0.8
-"""The same after joint refinement of all frames: 95 % if every match were correct, less a sixth of wrong matches."""
+"""Minimum share of inliers of all frames: 95 % if every match were correct, less a sixth of wrong matches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +102,7 @@ class Bootstrap:
         self.seed = seed
         self.reference = reference
         self.guess_depth = guess_depth = guess[:, 0]
+        self.prior = prior_of(*guess.T)
         self.max_matched = 0
         """Maximum number of inliers so far, of frames that differ from the reference."""
         self.views: list[BootstrapView] = []
@@ -114,7 +111,7 @@ class Bootstrap:
         with slam_map.lock:
             slam_map.anchors.begin_pass()
             ids = slam_map.anchors.add(points, reference.words, reference.id, True, colour)
-            slam_map.anchors.rest_on_prior(ids, reference.id, reference.centre_w, prior_of(*guess.T))
+            slam_map.anchors.rest_on_prior(ids, reference.id, reference.centre_w, self.prior)
             reference.anchor[:] = ids
             slam_map.add_keyframe(reference)
             slam_map.refresh_anchors(ids)
@@ -144,8 +141,8 @@ class Bootstrap:
         keypoint_of_anchor[self.reference.anchor] = np.arange(len(self.reference.anchor))
         return keypoint_of_anchor[track.matched_anchor]
 
-    def two_views(self, frame_index: int, view: View, track: Track) -> TwoView:
-        """Store the frame's matches and try to triangulate those of corners with the reference.
+    def two_views(self, frame_index: int, view: View, track: Track, leaving: bool = False) -> TwoView:
+        """Store the frame's matches and estimate the structure of all frames so far from those of corners.
 
         Keypoints on edges slide along them (aperture problem): hundreds on a panelled wall fit an essential matrix of a
         wrong motion, with a sharp minimum.
@@ -154,94 +151,74 @@ class Bootstrap:
             frame_index: Index of the frame.
             view: Its features.
             track: Its matches.
+            leaving: Whether it is the last one that sees enough of the reference.
         """
+        reference, camera, keypoint = self.reference, self.tracker.camera, track.matched_keypoint
         reference_keypoint = self._reference_keypoints(track)
-        self.views.append(
-            BootstrapView(
-                frame_index,
-                view.features.uv[track.matched_keypoint],
-                view.inv_sigma[track.matched_keypoint],
-                reference_keypoint,
-                track.T_c_w,
-            )
-        )
-        keypoint = track.matched_keypoint
-        both = self.reference.features.on_corners(reference_keypoint) & view.features.on_corners(keypoint)
-        matches = reference_keypoint[both], keypoint[both]
-        found = self._two_view_map(view, *matches, self.seed)
-        if found.ok and len(self.views) == 1:
-            others = (self._two_view_map(view, *matches, self.seed + k) for k in range(1, OTHER_SAMPLES + 1))
-            if not all(other.ok and self._same_direction(found, other) for other in others):
-                return replace(found, ok=False, reason="no frame between decides what random samples leave open")
-        return found
+        uv, inv_sigma = view.features.uv[keypoint], view.inv_sigma[keypoint]
+        self.views.append(BootstrapView(frame_index, uv, inv_sigma, reference_keypoint, track.T_c_w))
+        if len(self.views) == 1 and not leaving:  # matches of repetitive texture fit many motions of two views
+            return TwoView("two views need a third")
+        both = reference.features.on_corners(reference_keypoint) & view.features.on_corners(keypoint)
+        reference_keypoint, keypoint = reference_keypoint[both], keypoint[both]
+        if len(keypoint) < MIN_POINTS:
+            return TwoView(f"only {len(keypoint)} corners matched")
+        least = np.deg2rad(self.config.min_parallax_deg)
+        awaited = min(least, np.deg2rad(LAST_CHANCE_DEG)) if leaving else least
+        angle = self._rotation_residual(view, reference_keypoint, keypoint)
+        if angle < awaited:
+            return TwoView("pure rotation", angle)
+        p_r = camera.back_project(reference.features.uv[reference_keypoint], self.guess_depth[reference_keypoint])
+        guess = Structure(track.T_c_w, reference_keypoint, keypoint, se3.transform(reference.T_w_c, p_r))
+        best = self._most_probable(view, guess)
+        structure = best.structure
+        angle = self._rotation_residual(view, structure.reference_keypoint, structure.keypoint)  # without outliers
+        if angle < awaited:
+            return TwoView("pure rotation", angle)
+        if best.direction_sigma > (MAX_DIRECTION_SIGMA_ALONE if self._alone else self.config.max_direction_sigma):
+            return TwoView("rotation and translation are not yet distinguishable", angle)
+        structure = at_scale_of(reference, structure, self.guess_depth[structure.reference_keypoint])
+        structure = structure.at(triangulated(structure, reference, least))
+        if best.agreeing < AGREEING_SHARE:
+            return TwoView("the frames disagree with one structure", angle)
+        if len(structure.p_w) < MIN_POINTS:
+            return TwoView(f"only {len(structure.p_w)} points triangulate", angle)
+        return TwoView("", angle, structure)
 
-    def _two_view_map(self, view: View, reference_keypoint: IntArray, keypoint: IntArray, seed: int) -> TwoView:
-        camera, config = self.tracker.camera, self.config
-        return two_view_map(self.reference, self.guess_depth, view, reference_keypoint, keypoint, camera, config, seed)
+    def _rotation_residual(self, view: View, reference_keypoint: IntArray, keypoint: IntArray) -> float:
+        """Median angle of matches ``(M,)`` that the best rotation leaves [rad]; zero without any."""
+        uv_r, uv_c = self.reference.features.uv[reference_keypoint], view.features.uv[keypoint]
+        return rotation_residual(uv_r, uv_c, self.tracker.camera) if len(keypoint) else 0.0
 
-    def _same_direction(self, a: TwoView, b: TwoView) -> bool:
-        """Whether two structures agree on the camera motion, within the allowed uncertainty of both directions."""
-        one, other = (se3.inverse(two_view.T_c_w)[:3, 3] - self.reference.centre_w for two_view in (a, b))
-        cosine = float(one @ other) / float(np.linalg.norm(one) * np.linalg.norm(other))
-        return cosine > np.cos(np.sqrt(2.0) * self.config.max_direction_sigma)
+    @property
+    def _alone(self) -> bool:
+        """Whether there is no depth network."""
+        return self.reference.depth is None
 
-    def confirm(self, view: View, two_view: TwoView) -> TwoView:
-        """The structure refined over all frames, or rejected with a reason."""
-        points = np.full((len(self.reference.anchor), 3), np.nan)
-        points[two_view.reference_keypoint] = two_view.p_w
-        poses, share = poses_of_witnesses(self.views[:-1], points, self.tracker.camera)
-        if share < WITNESS_SHARE:
-            return replace(two_view, ok=False, reason="the frames between disagree with two views")
-        joint = consensus(self.reference, two_view, view, self.views[:-1], poses, self.tracker.camera)
-        if self.reference.depth is not None:
-            joint = self._likelier(joint, self._from_guess(view, two_view))
-        logger.debug("initialisation: %s", joint)
-        if joint.agreeing < AGREEING_SHARE or len(joint.two_view.p_w) < MIN_POINTS:
-            return replace(two_view, ok=False, reason="the frames together disagree with two views")
-        alone = self.reference.depth is None
-        most = MAX_DIRECTION_SIGMA_ALONE if alone else self.config.max_direction_sigma
-        if joint.direction_sigma > most:
-            return replace(two_view, ok=False, reason="rotation and translation are not yet distinguishable")
-        return joint.two_view
+    def _most_probable(self, view: View, guess: Structure) -> Consensus:
+        """The more probable of two minima under the network's depth, refined by the images alone.
 
-    def _from_guess(self, view: View, two_view: TwoView) -> Consensus:
-        """The same matches refined from the poses and points of tracking against the network's depth."""
-        reference, keypoint = self.reference, two_view.reference_keypoint
-        p_r = self.tracker.camera.back_project(reference.features.uv[keypoint], self.guess_depth[keypoint])
-        start = replace(two_view, T_c_w=self.views[-1].T_c_w, p_w=se3.transform(reference.T_w_c, p_r))
-        tracked = [v.T_c_w for v in self.views[:-1]]
-        joint = consensus(reference, start, view, self.views[:-1], tracked, self.tracker.camera)
-        return replace(joint, two_view=self._at_guessed_scale(joint.two_view))
-
-    def _likelier(self, a: Consensus, b: Consensus) -> Consensus:
-        """Of two structures the one that fits the images; if both do, the one closer in shape to the network's depth.
-
-        A small rotation and a small translation have similar image motion, so the cost has two minima: the right one,
-        and a flatter scene with a larger rotation.
+        The result has the standard deviation under the prior: a flat valley of the reprojection error looks sharp where
+        the images alone are at its wrong end.
         """
-        if max(a.cost, b.cost) > MAX_COST_RATIO * min(a.cost, b.cost):
-            return a if a.cost < b.cost else b
-        return a if self._unlike_network(a) <= self._unlike_network(b) else b
+        reference, camera, between = self.reference, self.tracker.camera, self.views[:-1]
+        prior = None if self._alone else self.prior[guess.reference_keypoint]
+        minima = [consensus(reference, guess, view, between, [v.T_c_w for v in between], camera, prior)]
+        moved = from_essential_matrix(reference, guess, view, camera, self.seed)
+        if moved is not None:
+            minima.append(consensus(reference, moved, view, between, self._poses(moved), camera, prior))
+        best = min(minima, key=lambda minimum: minimum.cost)
+        logger.debug("initialisation: %s", minima)
+        if prior is None or len(best.structure.p_w) == 0:
+            return best
+        free = consensus(reference, best.structure, view, between, self._poses(best.structure), camera)
+        return replace(free, direction_sigma=best.direction_sigma)
 
-    def _unlike_network(self, joint: Consensus) -> float:
-        """Robust spread of the log ratio of triangulated to predicted depth, independent of scale."""
-        ratio = self._log_ratio(joint.two_view)
-        return float(np.median(np.abs(ratio - np.median(ratio)))) if len(ratio) else np.inf
-
-    def _log_ratio(self, two_view: TwoView) -> FloatArray:
-        """Log of triangulated over predicted depth ``(P,)``."""
-        z = se3.transform(self.reference.T_c_w, two_view.p_w)[:, 2]
-        return np.log(np.maximum(z, 1e-9) / self.guess_depth[two_view.reference_keypoint])
-
-    def _at_guessed_scale(self, two_view: TwoView) -> TwoView:
-        """Structure and baseline scaled to the median of the predicted depths, as in `two_view_map`."""
-        if len(two_view.p_w) == 0:
-            return two_view
-        scale = np.exp(-np.median(self._log_ratio(two_view)))
-        T_c_r = two_view.T_c_w @ self.reference.T_w_c
-        T_c_r[:3, 3] *= scale
-        p_r = se3.transform(self.reference.T_c_w, two_view.p_w) * scale
-        return replace(two_view, T_c_w=T_c_r @ self.reference.T_c_w, p_w=se3.transform(self.reference.T_w_c, p_r))
+    def _poses(self, structure: Structure) -> list[FloatArray]:
+        """Poses of the frames between against a structure."""
+        points = np.full((len(self.reference.anchor), 3), np.nan)
+        points[structure.reference_keypoint] = structure.p_w
+        return poses_between(self.views[:-1], points, self.tracker.camera)
 
     def wait(self, frame: Frame, view: View, track: Track) -> None:
         """Store every few frames; above the limit, remove the one nearest to its neighbours.
@@ -257,27 +234,27 @@ class Bootstrap:
             centres = np.stack([self.reference.centre_w, *(w.centre_w for w in self.waiting)])
             self.waiting.pop(int(np.linalg.norm(centres[2:] - centres[:-2], axis=1).argmin()))
 
-    def replace_map(self, frame: Frame, view: View, two_view: TwoView, lm: LmConfig) -> StartedMap:
-        """Replace the predicted map by the two-view map and refine it over all its keyframes.
+    def replace_map(self, frame: Frame, view: View, structure: Structure, lm: LmConfig) -> StartedMap:
+        """Replace the predicted map by the triangulated one and refine it over all its keyframes.
 
         Args:
             frame: The second view.
             view: Its features.
-            two_view: The structure, confirmed.
+            structure: From `two_views`.
             lm: Solver settings.
         """
         reference = self.reference
-        colour = self.map.anchors.colour[reference.anchor[two_view.reference_keypoint]]
+        colour = self.map.anchors.colour[reference.anchor[structure.reference_keypoint]]
         self.map.remove_anchors(self._guessed)
         self.map.anchors.begin_pass()
         ids = self.map.anchors.add(
-            two_view.p_w, reference.words[two_view.reference_keypoint], reference.id, False, colour
+            structure.p_w, reference.words[structure.reference_keypoint], reference.id, False, colour
         )
-        self.map.observe(reference, two_view.reference_keypoint, ids)
+        self.map.observe(reference, structure.reference_keypoint, ids)
         poses = self._poses_between({w.frame.index for w in self.waiting})
         new = [(w.frame, self._keyframe(w, poses[w.frame.index])) for w in self.waiting if w.frame.index in poses]
-        second = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, two_view.T_c_w, view.features)
-        second.anchor[two_view.keypoint] = ids
+        second = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, structure.T_c_w, view.features)
+        second.anchor[structure.keypoint] = ids
         new.append((frame, second))
         for _, keyframe in new:
             self.map.add_keyframe(keyframe)
@@ -316,7 +293,7 @@ class Bootstrap:
         points = np.full((len(self.reference.anchor), 3), np.nan)
         points[observed] = self.map.anchors.p_w[self.reference.anchor[observed]]
         views = [v for v in self.views[:-1] if v.frame_index in frames]
-        poses, _ = poses_of_witnesses(views, points, self.tracker.camera)
+        poses = poses_between(views, points, self.tracker.camera)
         return {v.frame_index: T for v, T in zip(views, poses, strict=True)}
 
     def _keyframe(self, waiting: WaitingFrame, T_c_w: FloatArray) -> Keyframe:

@@ -404,6 +404,9 @@ def test_a_window_may_hold_only_edges_or_only_junctions():
         ({"obs_pose": np.array([0])}, "equally long"),
         ({"pose_fixed": np.array([True])}, "pose_fixed"),
         ({"obs_anchor": np.full(600, 150)}, "obs_anchor must lie"),
+        ({"depth_priors": DepthPriors(*np.array([[0], [0]]), np.ones(1), np.ones(2))}, "depth_priors must be equally"),
+        ({"depth_priors": DepthPriors(*np.array([[150], [0]]), *np.ones((2, 1)))}, "depth_priors.anchor must lie"),
+        ({"depth_priors": DepthPriors(*np.array([[0], [-1]]), *np.ones((2, 1)))}, "depth_priors.pose must lie"),
     ],
 )
 def test_misuse_names_the_array(change, message):
