@@ -153,8 +153,8 @@ def test_edge_map_and_anchors_lie_on_the_surfaces(run, scale_m):
     """Half a pixel at 260 px over 40 cm is 4 cm at 3 m: edges seen from many places are nearer than that. A network's
     metres are .3 to .8 % off, of 3 m (.022 and .025 m in metres, by the pictures drawn)."""
     slam, _ = run()
-    # Median distance [m], share within 10 cm; 0.012, 0.97, 0.029 and 0.79 when written, 0.022 in metres.
-    for cloud, count, median_m, share in ((slam.edge_map(), 14_000, 0.018, 0.95), (slam.anchors(), 900, 0.036, 0.75)):
+    # Median distance [m], share within 10 cm; 0.011 to 0.019 and 0.97 by where the film begins, 0.022 in metres.
+    for cloud, count, median_m, share in ((slam.edge_map(), 14_000, 0.021, 0.95), (slam.anchors(), 900, 0.036, 0.75)):
         median_m += scale_m
         assert len(cloud.p_w) >= count
         distance = panels().world.distance_to_surface(in_the_world(slam, cloud.p_w.astype(np.float64)))
