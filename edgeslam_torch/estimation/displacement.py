@@ -71,6 +71,8 @@ class TelemetryModel:
     """Probability that velocities are truncated, not rounded."""
     attitude: bool = True
     """Whether attitude is usable."""
+    new_map: bool = False
+    """Whether the map is only seconds old."""
     gain_sigma: tuple[float, ...] = (0.0, 0.0, 0.0)
     """Relative standard deviation of each velocity column, beyond that of the scale."""
 
@@ -78,6 +80,11 @@ class TelemetryModel:
     def metric(self) -> bool:
         """Whether the metric scale is known."""
         return math.isfinite(self.scale_sigma_log)
+
+    @property
+    def holds_level(self) -> bool:
+        """Whether attitude constrains the frames: the map still rests on predicted depths."""
+        return self.new_map and not self.metric
 
     def positions(
         self, stamps_s: FloatArray, p_m: FloatArray, scale_sigma_log: float | None = None

@@ -20,6 +20,9 @@ ATTITUDE = 0.25
 EFFECTIVE_SAMPLES_AT_THE_END = 1.0
 """The same in the last refinement: drift was corrected in flight, and telemetry errors, correlated over seconds, would
 deform the map."""
+GUESSED = 3000.0
+"""The same for gravity in a new map without metric scale: predicted depths, whose errors are correlated over the whole
+image, distinguish rotation from translation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +75,8 @@ def motion_factors(
             centres.append(CentreFactor(order, effective_samples * inert, np.zeros(len(inert)), 0.0))
         up, attitude = model.up(stamps), max(1.0, ATTITUDE * effective_samples)
         if up is not None:
-            gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(attitude)))
+            share = GUESSED if model.holds_level else attitude
+            gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(share)))
         heading = model.headings(stamps)
         if heading is not None:
             poses = order[heading.frame]

@@ -167,7 +167,8 @@ class System:
     def telemetry(self, *where: str) -> TelemetryModel | None:
         """Current telemetry, if the settings use it in one of these refinements."""
         wanted = self.has_telemetry and self.config.window.telemetry in where
-        return self.fusion.telemetry() if wanted else None
+        model = self.fusion.telemetry() if wanted else None
+        return None if model is None else replace(model, new_map=self._is_new(self.motion.stamp_s))
 
     def _is_new(self, stamp_s: float) -> bool:
         """Whether the submap of a frame began seconds ago."""

@@ -325,6 +325,16 @@ def test_gravity_has_the_weight_of_other_telemetry(rng, halves):
     assert np.degrees(gravity.sigma_rad) == pytest.approx(2.0 * np.sqrt(5.0) / np.sqrt(30.0), rel=0.15)
 
 
+def test_gravity_dominates_in_a_new_map_without_metric_scale(rng, halves):
+    """Then depths are guesses: a third of a degree is worth less than the attitude of a drone, and not after that."""
+    model = telemetry_of(rng, halves)
+    (before,), (after,) = (
+        motion_factors(m, halves.keyframes, [0] * 6).gravity
+        for m in (replace(model, scale_sigma_log=np.inf, velocity=False, new_map=True), model)
+    )
+    assert np.degrees(before.sigma_rad) < 0.1 < 0.5 < np.degrees(after.sigma_rad)
+
+
 def test_a_whole_map_may_use_the_full_weight_of_telemetry(rng, halves):
     """In a window of the flight 120 times, beside keypoints that err together; attitude thirty times."""
     model, keyframes = telemetry_of(rng, halves), halves.keyframes
