@@ -14,7 +14,7 @@ import pytest
 from edgeslam_torch import compiled as module
 from edgeslam_torch.compiled import build, cache, machine_code
 from edgeslam_torch.compiled.signature import parsed
-from edgeslam_torch.compiled.user_cache import cache_folder
+from edgeslam_torch.files.user_cache import cache_folder
 
 PACKAGE = Path(module.__file__).parent.parent
 COMPILED = sorted(
@@ -196,6 +196,17 @@ def test_a_missing_symbol_is_an_error_and_not_the_end_of_the_process(source):
     code.needed.append("no_such_function")
     with pytest.raises(OSError, match="no_such_function"):
         machine_code.link(code)
+
+
+@pytest.mark.parametrize("renamed", ["_dynfunc", "_helperlib", "core.runtime._nrt_python"])
+def test_a_version_of_numba_with_other_names_inside_links_itself(source, renamed, monkeypatch, caplog):
+    imported(source).filled(3)
+    known = machine_code._extension
+    monkeypatch.setattr(machine_code, "_extension", lambda name: known(name.replace(renamed, "_no_longer_there")))
+    machine_code._define_symbols.cache_clear()
+    assert imported(source).filled(3).tolist() == [2.0] * 3
+    assert "every run" in caplog.text
+    machine_code._define_symbols.cache_clear()
 
 
 @pytest.mark.parametrize(

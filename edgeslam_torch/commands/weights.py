@@ -48,7 +48,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _list(_: argparse.Namespace) -> None:
-    from edgeslam_torch.compiled.user_cache import cache_folder
+    from edgeslam_torch.files.user_cache import cache_folder
     from edgeslam_torch.models.download import REMOTES
     from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
     from edgeslam_torch.models.record import SHIPPED_WEIGHTS
@@ -64,8 +64,8 @@ def _list(_: argparse.Namespace) -> None:
 
 
 def _download(args: argparse.Namespace) -> None:
-    from edgeslam_torch.compiled.user_cache import cache_folder
     from edgeslam_torch.files.download import remember, remembered
+    from edgeslam_torch.files.user_cache import cache_folder
     from edgeslam_torch.models.download import REMOTES
     from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
 

@@ -83,19 +83,34 @@ class Loops:
 
 
 def _link(source: Path) -> None:
-    """Link the functions of a file, and compile them if they are not cached."""
-    from edgeslam_torch.compiled.cache import load, save
-    from edgeslam_torch.compiled.machine_code import link
+    """Link the functions of a file, and compile them if they are not cached.
 
+    Where a version of numba has other names for its inner parts than those known here, it compiles and links itself,
+    in every process.
+    """
     functions = _FILES[source]
     with _LINKING:
         if all(loops._call for loops in functions.values()):
             return
-        codes = load(source)
-        if codes is None:
-            from edgeslam_torch.compiled.build import build
+        calls: dict[str, Callable[..., Any]]
+        try:
+            calls = _machine_code(source, functions)
+        except (OSError, ImportError, AttributeError) as error:
+            logger.warning("%s is compiled in every run: %s", source.name, error)
+            calls = {name: loops.numba for name, loops in functions.items()}
+        for name, call in calls.items():
+            functions[name]._call = call
 
-            codes = {name: build(loops.numba, f"({loops.types},)") for name, loops in functions.items()}
-            save(source, codes)
-        for name, code in codes.items():
-            functions[name]._call = link(code)
+
+def _machine_code(source: Path, functions: dict[str, Loops]) -> dict[str, Callable[..., Any]]:
+    """The functions of a file, from the cache if they are in it."""
+    from edgeslam_torch.compiled.cache import load, save
+    from edgeslam_torch.compiled.machine_code import link
+
+    codes = load(source)
+    if codes is None:
+        from edgeslam_torch.compiled.build import build
+
+        codes = {name: build(loops.numba, f"({loops.types},)") for name, loops in functions.items()}
+        save(source, codes)
+    return {name: link(code) for name, code in codes.items()}

@@ -4,7 +4,6 @@ import hashlib
 import importlib.util
 import logging
 import pickle
-import secrets
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
@@ -14,7 +13,8 @@ import llvmlite
 import numpy as np
 
 from edgeslam_torch.compiled.machine_code import MachineCode, numba_folder, processor
-from edgeslam_torch.compiled.user_cache import cache_folder
+from edgeslam_torch.files.atomic import write_atomically
+from edgeslam_torch.files.user_cache import cache_folder
 
 logger = logging.getLogger(__name__)
 
@@ -38,25 +38,14 @@ def load(source: Path) -> dict[str, MachineCode] | None:
 def save(source: Path, codes: dict[str, MachineCode]) -> None:
     """Keep the machine code for later runs; other processes see all of it or nothing."""
     content = pickle.dumps(codes)
-    for file in _places(source):
+    for place in _places(source):
         try:
-            _write(file, _digest(content) + content)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(place, lambda file: file.write(_digest(content) + content))
             return
         except OSError:
             continue
     logger.warning("no writable cache: every run compiles again")
-
-
-def _write(file: Path, content: bytes) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_suffix(f".{secrets.token_hex(8)}.part")
-    try:
-        partial.write_bytes(content)
-        partial.replace(file)
-    except OSError:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
-        raise
 
 
 def _places(source: Path) -> Iterator[Path]:

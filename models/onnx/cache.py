@@ -3,9 +3,9 @@
 import hashlib
 from pathlib import Path
 
-from edgeslam_torch.compiled.user_cache import cache_folder
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.files.atomic import write_atomically
+from edgeslam_torch.files.user_cache import cache_folder
 from edgeslam_torch.models.record import SHIPPED_WEIGHTS, Metadata
 from edgeslam_torch.models.weights_file import read_header
 

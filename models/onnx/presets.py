@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edgeslam_torch.compiled.user_cache import cache_folder
+from edgeslam_torch.files.user_cache import cache_folder
 from edgeslam_torch.models.download import Remote
 
 IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}
