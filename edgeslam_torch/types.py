@@ -202,29 +202,14 @@ class DepthMap(Record):
     """Whether the inverse of ``depth_m`` is right up to an unknown scale and shift only; it is not in metres then."""
 
 
-class MotionKind(StrEnum):
-    """Kind of motion between two views."""
-
-    GENERAL = "general"
-    PURE_ROTATION = "pure rotation"
-    PLANAR = "planar scene"
-    NO_MOTION = "no motion"
-    FEW_MATCHES = "few matches"
-    DEGENERATE = "degenerate"
-
-
 @dataclass(frozen=True, slots=True, repr=False)
 class RelativePose(Record):
     """Two-view motion from the essential matrix (stage 2), paper eqs. (2)-(5)."""
 
-    kind: MotionKind
     T_j_i: FloatArray
-    """``(4, 4)``, takes coordinates of view i to view j; translation of unit length, unless ``kind`` says that there
-    is none."""
+    """``(4, 4)``, takes coordinates of view i to view j; translation of unit length."""
     inliers: NDArray[np.bool_]
-    """``(M,)`` inlier matches."""
-    parallax_rad: float
-    """Median ray angle of the inliers, rotation removed."""
+    """``(M,)`` inlier matches; none if there is no motion."""
 
 
 class Units(StrEnum):

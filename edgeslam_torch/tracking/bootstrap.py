@@ -22,10 +22,10 @@ from edgeslam_torch.tracking.initialiser import (
     consensus,
     from_essential_matrix,
     poses_between,
-    rotation_residual,
     triangulated,
 )
 from edgeslam_torch.tracking.pose_prior import TrackingPrior
+from edgeslam_torch.tracking.relative_pose import rotation_residual
 from edgeslam_torch.tracking.tracker import MOTION_RADIUS_PX, Track, Tracker, View
 from edgeslam_torch.types import FloatArray, Frame, IntArray
 

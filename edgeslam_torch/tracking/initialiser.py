@@ -73,15 +73,6 @@ class TwoView:
     structure: Structure | None = None
 
 
-def rotation_residual(uv_r: FloatArray, uv_c: FloatArray, camera: Camera) -> float:
-    """Median angle between matched rays of pixels ``(M, 2)`` that the best rotation leaves [rad] (Kabsch 1976)."""
-    ray_r, ray_c = bearings(uv_r, camera.K), bearings(uv_c, camera.K)
-    unit_r, unit_c = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in (ray_r, ray_c))
-    u, _, vt = np.linalg.svd(unit_c.T @ unit_r)
-    R_c_r = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return float(np.median(parallax(ray_r, ray_c, R_c_r)))
-
-
 def from_essential_matrix(
     reference: Keyframe, guess: Structure, view: View, camera: Camera, seed: int = 0
 ) -> Structure | None:

@@ -20,7 +20,6 @@ from edgeslam_torch.tracking.initialiser import (
     Structure,
     from_essential_matrix,
     poses_between,
-    rotation_residual,
     triangulated,
 )
 from edgeslam_torch.tracking.tracker import Tracker, make_view
@@ -108,17 +107,6 @@ def test_pure_rotation_is_rejected_with_a_reason(points):
     found = bootstrap.two_views(1, view, track, leaving=True)
     assert found.structure is None
     assert found.reason == "pure rotation"
-
-
-def test_the_residual_of_a_rotation_is_the_parallax(points, rng):
-    """Zero for a rotation; for points abeam at one distance the angle of the baseline."""
-    view, ahead = turned_view(points, se3.exp(np.array([0, 0, 0, 0.02, 0.1, 0.03])))
-    uv = points.keyframes[0].features.uv[ahead]
-    assert rotation_residual(uv, view.features.uv[ahead], CAMERA) < 1e-4
-    p = np.column_stack([rng.uniform(-0.3, 0.3, (200, 2)), np.repeat([2.0, 4.0], 100)])
-    moved = p + [0.1, 0.0, 0.0]
-    # The best rotation takes the mean of 0.1 / 2 and 0.1 / 4, either distance keeps half the difference.
-    assert rotation_residual(CAMERA.project(p), CAMERA.project(moved), CAMERA) == pytest.approx(0.0125, rel=0.1)
 
 
 def test_few_matches_are_rejected_with_a_reason(points):
