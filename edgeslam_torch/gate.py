@@ -38,5 +38,6 @@ def passes(residual: FloatArray, covariance: FloatArray, confidence: float = CON
     """
     known = np.isfinite(np.diag(covariance))
     r = residual[known]
-    distance = r @ np.linalg.solve(covariance[np.ix_(known, known)], r)
+    with np.errstate(over="ignore"):  # a distance beyond the largest number is infinite, and refused
+        distance = r @ np.linalg.solve(covariance[np.ix_(known, known)], r)
     return not known.any() or exceedance(float(distance), int(known.sum())) >= 1.0 - confidence
