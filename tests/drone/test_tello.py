@@ -373,9 +373,3 @@ def test_djitellopy_flies_the_emulator(monkeypatch):
         assert emulator.drone.mode is Mode.GROUND
         assert drone.query_battery() > 90
         drone.end()
-
-
-@pytest.mark.parametrize("text", ["tello://a:b", "tello://a:0", "tello://a:1:2:3:4", "tello://a b", "tello://a:70000"])
-def test_wrong_addresses_are_refused(text):
-    with pytest.raises(SourceError):
-        TelloAddress.parse(text)

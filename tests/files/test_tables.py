@@ -95,19 +95,21 @@ def test_units_at_their_limits():
     assert seconds_of([5.0, np.nan, 5.0, 1e154])[1] == UNKNOWN
 
 
-def test_the_separator_is_that_of_the_header(tmp_path):
-    path = written(tmp_path, "recording,settings\na.mp4,x=1;y=2\nb.mp4,x=1;y=2\n")
-    assert [row.cells for row in read_table(path, SourceError).rows] == [["a.mp4", "x=1;y=2"], ["b.mp4", "x=1;y=2"]]
+@pytest.mark.parametrize(
+    ("text", "rows"),
+    [
+        ("recording,settings\na.mp4,x=1;y=2\n", [["a.mp4", "x=1;y=2"]]),  # the separator is that of the header
+        ("a,b\n1,2,\n3,4,\n", [["1", "2"], ["3", "4"]]),  # one at the end of each row adds no column
+        ("a,b,c\n1,2,\n3,4,\n", [["1", "2", ""], ["3", "4", ""]]),
+    ],
+)
+def test_cells_are_parted_as_the_header_says(tmp_path, text, rows):
+    assert [row.cells for row in read_table(written(tmp_path, text), SourceError).rows] == rows
 
 
 def test_quoted_numbers_with_decimal_commas_between_commas(tmp_path):
     path = written(tmp_path, '"t","x"\n"1,5","2,25"\n"2,5","3"\n')
     assert read_table(path, SourceError).numbers().tolist() == [[1.5, 2.25], [2.5, 3.0]]
-
-
-def test_a_separator_at_the_end_of_each_row_adds_no_column(tmp_path):
-    assert read_table(written(tmp_path, "a,b\n1,2,\n3,4,\n"), SourceError).numbers().shape == (2, 2)
-    assert read_table(written(tmp_path, "a,b,c\n1,2,\n3,4,\n"), SourceError).rows[0].cells == ["1", "2", ""]
 
 
 @pytest.mark.parametrize("text", ["", "1_000", "12cm", "1.000,5", "1,2,3", ",", "x"])

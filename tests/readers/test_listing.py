@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.readers.listing import ImageEntry, Problem, entries_in_time, in_order, read_list
+from edgeslam_torch.readers.listing import ImageEntry, entries_in_time, in_order, read_list
 from edgeslam_torch.readers.source import open_source
 
 
@@ -26,10 +26,8 @@ def test_one_wild_stamp_costs_one_image():
 def test_a_list_that_runs_backwards_is_used_forwards_and_costs_nothing():
     kept, problems = in_order(entries([4, 3, 2, 2, 1]), "rgb.txt")
     assert [e.stamp_s for e in kept] == [1, 2, 3, 4]
-    assert problems[0] == Problem(
-        "rgb.txt", "lists images from the last to the first; they are used sorted by stamp", frames=0
-    )
-    assert [p.frames for p in problems[1:]] == [1]  # the repetition
+    assert "from the last to the first" in problems[0].reason
+    assert [p.frames for p in problems] == [0, 1]  # the list, and the repetition
 
 
 @given(st.lists(st.floats(-1e9, 1e9), max_size=60))
@@ -53,12 +51,12 @@ def test_stamps_in_any_unit_become_seconds_and_a_relative_clock_is_said(begin_s,
     assert [word in problem.reason for problem in problems] == ([True] if word and begin_s < 1e9 else [])
 
 
-@pytest.mark.parametrize(("step", "said"), [(1, True), (10, True), (0.5, False), (1.01, False)])
-def test_frame_numbers_in_place_of_stamps_are_said(step, said):
+@pytest.mark.parametrize(("step", "said"), [(1, "numbers"), (10, "numbers"), (1e-5, "no unit"), (0.5, ""), (1.01, "")])
+def test_frame_numbers_and_other_numbers_in_place_of_stamps_are_said(step, said):
     stamps = step * np.arange(30) + 0.001 * (step == 1.01) * np.arange(30) ** 2
     kept, problems = entries_in_time(stamps, [Path(f"{i}.png") for i in range(30)], "rgb.txt")
     assert len(kept) == 30
-    assert bool(problems) == said
+    assert [said in problem.reason for problem in problems] == [True] * bool(said)
 
 
 @pytest.mark.parametrize("stamp", [float("nan"), 1e154, -1e154, float("inf")])
@@ -99,19 +97,11 @@ def test_repeated_stamp_is_left_out_and_named():
     assert "repetition" in problems[0].reason
 
 
-def test_shuffled_list_is_sorted(rng):
+def test_shuffled_list_is_sorted_and_said(rng):
     stamps = rng.permutation(50)
     kept, problems = in_order(entries(stamps), "rgb.txt")
     assert [e.stamp_s for e in kept] == sorted(stamps)
-    assert problems == [
-        Problem("rgb.txt", "lists images in no order of their stamps; they are used sorted by stamp", 0)
-    ]
-
-
-def test_stamps_in_no_unit_are_said():
-    kept, problems = entries_in_time(np.arange(5) * 1e-5, [Path(f"{i}.png") for i in range(5)], "rgb.txt")
-    assert len(kept) == 5
-    assert "no unit" in problems[0].reason
+    assert [(p.file, p.frames) for p in problems] == [("rgb.txt", 0)]
 
 
 def test_identical_stamps_are_named_as_the_cause():

@@ -148,12 +148,6 @@ def test_what_is_no_source_is_refused_with_the_reason(tmp_path, files, source, s
         open_source(tmp_path / source)
 
 
-# -- calibration -------------------------------------------------------------------------------------------------
-
-
-# -- read-ahead --------------------------------------------------------------------------------------------------
-
-
 def write_y4m(path, count):
     """YUV4MPEG2, which needs no encoder."""
     frame = b"FRAME\n" + np.random.default_rng(0).integers(0, 255, 64 * 48 * 3 // 2, dtype=np.uint8).tobytes()
@@ -210,9 +204,11 @@ def test_seven_scenes_frame_that_is_there_twice_is_used_once(tmp_path, write_ima
     assert [p.frames for p in source.problems] == [1, 1]
 
 
-def test_recorded_video_with_its_own_stamps(video):
-    video.with_name("clip_stamps.txt").write_text("".join(f"{5.0 + 0.1 * i} {i}\n" for i in range(8)))
-    assert [f.stamp_s for f in open_source(video.parent).frames()] == pytest.approx([5.0 + 0.1 * i for i in range(8)])
+@pytest.mark.parametrize(("stamps", "seconds"), [([5.0, 5.1, 5.3], [5.0, 5.1, 5.3]), ([0, 50_000_000], [0.0, 0.05])])
+def test_a_video_has_the_stamps_of_the_file_beside_it_also_nanoseconds(tmp_path, stamps, seconds):
+    write_y4m(tmp_path / "clip.y4m", len(stamps))
+    (tmp_path / "clip_stamps.txt").write_text("".join(f"{stamp} {i}\n" for i, stamp in enumerate(stamps)))
+    assert [frame.stamp_s for frame in open_source(tmp_path).frames()] == pytest.approx(seconds)
 
 
 def test_video_of_too_many_pixels_is_refused(video, monkeypatch):
@@ -245,35 +241,20 @@ def test_one_image_is_a_source(tmp_path, write_images):
     assert [f.index for f in open_source(path).frames()] == [0]
 
 
-def test_given_calibration_wins_over_the_sources_own(tmp_path, write_tum):
-    folder = write_tum(tmp_path, 2, (640, 480))
-    save_camera(folder / "camera.yaml", Camera(640, 480, 50.0, 50.0, 320.0, 240.0))
-    assert open_source(folder, camera="kinect").camera.fx == 525.0
-
-
-def test_calibration_of_another_resolution_is_scaled_and_says_so(tmp_path, write_tum):
-    source = open_source(write_tum(tmp_path, 2, (320, 240)), camera="kinect")
+def test_given_calibration_wins_is_scaled_to_the_images_and_refused_for_another_shape(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "a", 2, (320, 240))
+    save_camera(folder / "camera.yaml", Camera(320, 240, 50.0, 50.0, 160.0, 120.0))
+    source = open_source(folder, camera="kinect")
     assert source.camera.fx == pytest.approx(262.5)
-    assert "scaled from 640x480 to 320x240" in source.camera.source
-    assert source.warnings
-
-
-def test_calibration_of_another_shape_is_refused_naming_both_sizes(tmp_path, write_tum):
+    assert "scaled from 640x480 to 320x240" in source.camera.source and source.warnings
     with pytest.raises(CalibrationError, match="640x480.*960x540"):
-        open_source(write_tum(tmp_path, 2, (960, 540)), camera="kinect")
+        open_source(write_tum(tmp_path / "b", 2, (960, 540)), camera="kinect")
 
 
 def test_the_small_copy_beside_a_video_is_no_second_one(tmp_path):
     write_y4m(tmp_path / "GX010001.mp4", 3)
     write_y4m(tmp_path / "GL010001.lrv", 2)
     assert len(list(open_source(tmp_path).frames())) == 3
-
-
-def test_stamps_beside_a_video_may_be_nanoseconds(tmp_path):
-    write_y4m(tmp_path / "clip.y4m", 3)
-    (tmp_path / "clip_stamps.txt").write_text("".join(f"{50_000_000 * i} {i}\n" for i in range(3)))
-    source = open_source(tmp_path)
-    assert [frame.stamp_s for frame in source.frames()] == pytest.approx([0.0, 0.05, 0.1])
 
 
 @pytest.mark.parametrize("size", [(1, 1), (640, 8), (16, 480)])

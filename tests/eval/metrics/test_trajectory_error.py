@@ -319,12 +319,11 @@ def test_monocular_run_judged_without_scale_is_warned_about(loop, rng):
     assert "without scale" not in findings(loop, small, "sim3")
 
 
-def test_one_pose_and_a_standing_camera_are_refused(loop):
+def test_one_pose_and_an_estimate_that_never_moves_are_refused(loop):
     with pytest.raises(EvaluationError, match="at least 2"):
         score_trajectory(loop, loop.take(slice(10, 11)))
-    still = replace(loop, T_w_c=np.tile(np.eye(4), (len(loop), 1, 1)))
     with pytest.raises(EvaluationError, match="never moves"):
-        score_trajectory(loop, still)
+        score_trajectory(loop, at(loop, [3.0, 2.0, 1.0]))
 
 
 def test_motion_along_a_line_is_pointed_out():
@@ -384,13 +383,6 @@ def test_each_pose_of_the_shorter_list_gets_its_nearest():
 def test_a_camera_that_only_shifts_has_orientations(loop, rng):
     jitter = Rotation.from_rotvec(rng.normal(0.0, 0.003, (len(loop), 3))).as_matrix()
     assert score_trajectory(turned(loop, np.eye(3)), turned(noisy(loop, rng), jitter)).rotation_deg.rmse < 2.0
-
-
-def test_late_stamps_are_measured(loop, rng):
-    estimate = noisy(loop, rng)
-    text = findings(loop, replace(estimate, stamps_s=estimate.stamps_s + 1.37))
-    found = re.search(r"--offset (-[\d.]+)", text)
-    assert found is not None and float(found.group(1)) == pytest.approx(-1.37, abs=0.025)  # half a frame
 
 
 def test_no_offset_is_offered_for_another_shape(loop):
