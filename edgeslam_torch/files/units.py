@@ -1,7 +1,6 @@
 """Units in the headers of tables, with or without brackets."""
 
 import math
-import re
 
 from edgeslam_torch.files.time_units import SECONDS_PER_UNIT
 
@@ -75,5 +74,9 @@ def split_unit(header: str) -> tuple[str, str]:
         >>> split_unit("Tof (m)"), split_unit("p_x [cm]"), split_unit("yaw_deg")
         (('Tof', 'm'), ('p_x', 'cm'), ('yaw_deg', ''))
     """
-    found = re.fullmatch(r"(.*?)[\s_]*[(\[]\s*([^)\]]*?)\s*[)\]]\s*", header)
-    return (found[1], found[2]) if found else (header, "")
+    text = header.rstrip()
+    start = max(text.rfind("("), text.rfind("["))
+    unit = text[start + 1 : -1]
+    if start < 0 or not text.endswith((")", "]")) or ")" in unit or "]" in unit:
+        return header, ""
+    return text[:start].rstrip(" \t_"), unit.strip()

@@ -1,6 +1,7 @@
 """The output folder of ``edgeslam run``, read back."""
 
 import csv
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import nearest
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.files.record_files import read_mapping, recording_of
+from edgeslam_torch.files.tables import read_text
 from edgeslam_torch.types import PointCloud
 from edgeslam_torch.writers.ply import read_ply
 from edgeslam_torch.writers.run_summary import vertical_text
@@ -141,13 +143,13 @@ def read_status(path: Path) -> tuple[dict[str, str], ...]:
     """
     if not path.is_file():
         return ()
+    lines = io.StringIO(read_text(path, EvaluationError), newline="")
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = tuple({k: v or "" for k, v in row.items() if k is not None} for row in csv.DictReader(file))
+        rows = tuple({k: v or "" for k, v in row.items() if k is not None} for row in csv.DictReader(lines))
         for row in rows:
             for name in _NUMBERS:
                 float(row.get(name) or "nan")
-    except (ValueError, csv.Error) as error:  # not UTF-8, too
+    except (ValueError, csv.Error) as error:
         raise EvaluationError(f"{path}: not the table of a run ({error})") from error
     return rows
 

@@ -1,6 +1,5 @@
 """The judge's record as a table that is Markdown too, one line a cell and every run below it; limits of its figures."""
 
-import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -12,6 +11,7 @@ import numpy as np
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.figures import grouped, markdown_table
 from edgeslam_torch.eval.judge.score import COLUMNS
+from edgeslam_torch.files.record_files import read_mapping
 
 THRESHOLDS = Path(__file__).with_name("thresholds.toml")
 _SIGNS = {"at_least": ">=", "at_most": "<=", "at_most_times_base": "<="}
@@ -67,12 +67,8 @@ def read_thresholds(path: Path = THRESHOLDS) -> list[Threshold]:
     Raises:
         EvaluationError: If it cannot be read or holds something else.
     """
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8")).get("threshold", [])
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise EvaluationError(f"{path}: cannot be read as thresholds ({error})") from error
     found = []
-    for table in tables:
+    for table in read_mapping(path, "TOML", EvaluationError).get("threshold", []):
         cells = tuple(table.pop("cells", ()))
         for figure, limit in table.items():
             kinds = [kind for kind in _SIGNS if isinstance(limit, dict) and kind in limit]

@@ -3,7 +3,7 @@
 import pytest
 
 from edgeslam_torch.errors import ConfigError
-from edgeslam_torch.files.record_files import MAX_BYTES, read_mapping
+from edgeslam_torch.files.record_files import read_mapping
 
 
 def test_a_record_is_read(tmp_path):
@@ -38,12 +38,3 @@ def test_toml_keys_of_endless_parts_are_refused_at_once(tmp_path, line):
     (tmp_path / "settings").write_text(f"a = 1\n{line}\n")
     with pytest.raises(ConfigError):
         read_mapping(tmp_path / "settings", "TOML", ConfigError)
-
-
-def test_json_of_another_kind_a_folder_and_a_huge_file_are_refused(tmp_path):
-    (tmp_path / "list").write_text("[1]")
-    with (tmp_path / "huge").open("wb") as file:
-        file.truncate(MAX_BYTES["JSON"] + 1)
-    for name in ("list", ".", "huge"):
-        with pytest.raises(ConfigError):
-            read_mapping(tmp_path / name, "JSON", ConfigError)

@@ -243,11 +243,3 @@ def test_an_angle_of_the_fov_model_is_fitted(tmp_path):
 
 def test_unknown_keys_are_named(tmp_path):
     assert any("exposure" in remark for remark in _read(tmp_path, OWN + "exposure: 3\n")[1])
-
-
-def test_a_huge_file_is_not_read(tmp_path):
-    path = tmp_path / "camera.yaml"
-    with path.open("wb") as file:
-        file.truncate(200_000_000)
-    with pytest.raises(CalibrationError, match="200 MB"):
-        read_camera(path)

@@ -196,16 +196,5 @@ def test_a_header_that_makes_no_sense_is_refused(tmp_path, header):
     refused(path)
 
 
-def test_empty_missing_and_foreign_files_are_named(tmp_path):
-    refused(tmp_path / "none")
-    refused(tmp_path)
-    for content in (b"", b"hello, this is no network at all", bytes(100)):
-        (tmp_path / "w").write_bytes(content)
-        refused(tmp_path / "w")
-    with (tmp_path / "huge").open("wb") as huge:
-        huge.truncate(1 << 33)
-    refused(tmp_path / "huge")
-
-
 def test_fields_of_newer_files_are_ignored():
     assert metadata_from_json(json.dumps(asdict(METADATA) | {"lens": "fisheye"})) == METADATA

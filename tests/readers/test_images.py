@@ -136,13 +136,6 @@ def test_a_grey_jpeg_stays_grey(entry):
     np.testing.assert_array_equal(frame.image, frame.grey)
 
 
-def test_a_file_too_large_for_an_image_is_not_read(tmp_path):
-    with (tmp_path / "a.png").open("wb") as file:
-        file.truncate(1 << 40)
-    with pytest.raises(SourceError, match="a.png: 1099512 MB is too large for an image"):
-        read_image(tmp_path / "a.png")
-
-
 def test_another_format_is_decoded_once(entry):
     frame = read_frame(entry("a.png", picture()))
     np.testing.assert_array_equal(frame.image, picture())

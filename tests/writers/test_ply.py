@@ -37,8 +37,6 @@ def test_ascii_file_of_another_program(tmp_path):
     "damage",
     [
         lambda b: b[:-10],
-        lambda b: b"",
-        lambda b: b"hello",
         lambda b: b.replace(b"end_header", b"end_hexder"),
         lambda b: b.replace(b"little", b"big"),
         lambda b: b.replace(b"property float x", b"property blob x"),

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_atomically
+from edgeslam_torch.files.plain import open_plain
 from edgeslam_torch.models.record import FOCAL_RANGE
 from edgeslam_torch.readers.image_size import image_size
 from edgeslam_torch.readers.images import MAX_PIXELS
@@ -153,7 +154,7 @@ def _samples_of(shard: Path) -> list[_Sample]:
     samples: list[_Sample] = []
     try:
         size = shard.stat().st_size
-        with tarfile.open(shard, "r:") as tar:
+        with open_plain(shard) as file, tarfile.open(fileobj=file, mode="r:") as tar:
             for member in tar:
                 if not member.isfile():
                     continue

@@ -113,15 +113,6 @@ def test_what_cannot_be_meant_is_refused(whole, tmp_path, change):
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("content", [None, b"", b"hello, this is no network", bytes(1000)])
-def test_empty_missing_and_foreign_files_are_named(tmp_path, content):
-    path = tmp_path / "w.onnx"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(WeightsError, match=r"w\.onnx"):
-        DepthPredictor(path)
-
-
 def test_random_damage_is_refused_or_harmless(whole, tmp_path, rng):
     path = tmp_path / "w.onnx"
     for k in range(40):
