@@ -53,6 +53,19 @@ class PointMap:
         self.map.refresh_anchors(anchor_of[points])
         return anchor_of
 
+    def part(self, is_odd):
+        """Leave a keyframe the anchors of odd numbers where ``is_odd`` of its own says so, else the even ones."""
+        for keyframe in self.keyframes:
+            other = np.flatnonzero((keyframe.anchor >= 0) & (keyframe.anchor % 2 != is_odd(keyframe.id)))
+            self.map.forget_observations(keyframe, other)
+
+
+def filled(rng, n_points=300, n_views=5, noise_px=0.0):
+    """A `PointMap` whose keyframes are all in the map."""
+    points = PointMap(rng, n_points, n_views, noise_px)
+    points.fill()
+    return points
+
 
 def check_map(slam_map):
     """What must hold of any map at any time."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from point_map import PointMap
+from point_map import filled
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.depth_prior import depth_prior, fit_to_anchors, sample
@@ -25,9 +25,7 @@ def test_too_few_usable_anchors_give_no_fit(bad):
 
 @pytest.fixture
 def points(rng):
-    made = PointMap(rng, 300, 3)
-    made.fill()
-    return made
+    return filled(rng, 300, 3)
 
 
 def true_depth(points, view):

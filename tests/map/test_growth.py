@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from point_map import PointMap, check_map
+from point_map import check_map, filled
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.growth import depths, take_along
@@ -10,9 +10,7 @@ from edgeslam_torch.map.growth import depths, take_along
 
 @pytest.fixture
 def points(rng):
-    made = PointMap(rng, 400, 6)
-    made.fill()
-    return made
+    return filled(rng, 400, 6)
 
 
 def grow(points, factor):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from point_map import PointMap, check_map, small_motion
+from point_map import PointMap, check_map, filled, small_motion
 
 from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.map.keyframe import make_keyframe
@@ -123,8 +123,7 @@ def test_rows_of_removed_anchors_are_reused_only_in_the_next_pass():
 
 
 def test_covisible_keyframes_come_by_number_of_shared_anchors(rng):
-    points = PointMap(rng, 300, 5)
-    points.fill()
+    points = filled(rng, 300, 5)
     first = points.keyframes[0]
     near = points.map.covisible(first, 10, min_shared=1)
     shared = [np.isin(k.anchor[k.anchor >= 0], first.anchor).sum() for k in near]

@@ -1,7 +1,7 @@
 """Poses of frames hang on keyframes."""
 
 import numpy as np
-from point_map import PointMap, small_motion
+from point_map import filled, small_motion
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.trajectory import TrajectoryLog
@@ -16,8 +16,7 @@ def forward(x):
 
 def test_frames_follow_their_keyframe_even_after_its_removal(rng):
     """Refinement moves the heir of a removed keyframe by M: the frames tied to either follow rigidly."""
-    points = PointMap(rng, 200, 3)
-    points.fill()
+    points = filled(rng, 200, 3)
     log = TrajectoryLog(points.map)
     poses = [small_motion(rng, 0.5, 0.2) for _ in range(4)]
     for i, T_c_w in enumerate(poses):
@@ -36,8 +35,7 @@ def test_frames_follow_their_keyframe_even_after_its_removal(rng):
 
 
 def test_replaced_poses_are_those_of_the_newest_frames_only(rng):
-    points = PointMap(rng, 200, 3)
-    points.fill()
+    points = filled(rng, 200, 3)
     log = TrajectoryLog(points.map)
     assert log.poses()[1].shape == (0, 4, 4)
     old, new = [small_motion(rng, 0.5, 0.2) for _ in range(4)], small_motion(rng, 0.5, 0.2)
@@ -54,8 +52,7 @@ def test_replaced_poses_are_those_of_the_newest_frames_only(rng):
 
 def test_frames_follow_the_next_keyframe_where_refinement_moved_it(rng):
     """Tracked twice as far as it was: halved between the keyframes, and no frame jumps."""
-    points = PointMap(rng, 200, 2)
-    points.fill()
+    points = filled(rng, 200, 2)
     a, b = points.keyframes
     a.T_c_w = np.eye(4)
 
@@ -74,8 +71,7 @@ def test_frames_follow_the_next_keyframe_where_refinement_moved_it(rng):
 
 def test_frames_of_the_first_map_are_corrected_too(rng):
     """It was never tracked as a frame; those after it are tied to it, those before it to the first keyframe."""
-    points = PointMap(rng, 200, 3)
-    points.fill()
+    points = filled(rng, 200, 3)
     first, second, third = points.keyframes
 
     first.T_c_w, second.T_c_w = forward(0.0), forward(0.4)

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from point_map import CAMERA, PointMap, small_motion
+from point_map import CAMERA, filled, small_motion
 
 from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.geometry import se3
@@ -22,13 +22,6 @@ def test_two_points_of_one_cell_worked_by_hand():
     assert cloud.colour.tolist() == [[80, 40, 0], [7, 8, 9]]
     np.testing.assert_allclose(cloud.sigma_m, [0.01, 0.03])
     assert cloud.observations.tolist() == [5, 3]
-
-
-def test_fusing_nothing_gives_nothing():
-    none = np.zeros((0, 3))
-    cloud = fuse_voxels(none, np.zeros(0), none.astype(np.uint8), np.zeros(0, int), 0.01)
-    assert cloud.p_w.shape == (0, 3)
-    assert len(cloud.observations) == 0
 
 
 def test_fused_points_stay_in_their_cells(rng):
@@ -57,9 +50,7 @@ def host(points, id, p_w, **changes):
 
 @pytest.fixture
 def points(rng):
-    made = PointMap(rng, 300, 3)
-    made.fill()
-    return made
+    return filled(rng, 300, 3)
 
 
 def edge_map(points, **settings):
@@ -157,6 +148,9 @@ def test_keyframe_without_image_or_partners_is_skipped(points):
 def test_number_of_points_is_bounded(points):
     """Old points that one keyframe alone saw go first, then the oldest are thinned; the newest stay whole."""
     some = edge_map(points, max_points=1000)
+    some.hosts.append(host(points, 0, points.world.p_w[:300]))
+    some._bound()
+    assert len(some.hosts.pop().uv) == 300, "below the limit nothing changes"
     for i in range(60):
         counts = np.r_[np.ones(20), np.full(10, 2)].astype(np.int32)
         some.hosts.append(host(points, i % 3, points.world.p_w[:30], observations=counts))
@@ -168,13 +162,6 @@ def test_number_of_points_is_bounded(points):
     few.hosts += [host(points, 0, points.world.p_w[:30]) for _ in range(3)]
     few._bound()
     assert sum(len(h.uv) for h in few.hosts) <= 1
-
-
-def test_a_limit_that_is_not_reached_changes_nothing(points):
-    some = edge_map(points, max_points=1000)
-    some.hosts.append(host(points, 0, points.world.p_w[:300]))
-    some._bound()
-    assert len(some.hosts[0].uv) == 300
 
 
 def test_the_nearest_edge_pixel_is_found_within_two_pixels(rng):
@@ -191,11 +178,9 @@ def test_the_nearest_edge_pixel_is_found_within_two_pixels(rng):
     assert np.mean(named[found >= 0] == nearest[found >= 0]) > 0.8
 
 
-def test_keyframes_without_a_measured_edge_are_an_empty_map(rng):
+def test_keyframes_without_a_measured_edge_are_an_empty_map(points):
     """No median of an empty set: numpy's warning would fail the test."""
-    points = PointMap(rng, 300, 3)
-    points.fill()
-    edges = EdgeMap(points.map, CAMERA, EdgeConfig())
+    edges = edge_map(points)
     edges.hosts.append(host(points, 0, np.zeros((0, 3))))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

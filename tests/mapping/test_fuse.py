@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from point_map import CAMERA, PointMap, check_map
+from point_map import CAMERA, PointMap, check_map, filled
 
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import words
@@ -46,8 +46,7 @@ def test_duplicates_are_merged(rng, join):
 
 def test_missing_observations_are_found(rng):
     """Also by keyframes that share nothing any more with those that hold the anchors."""
-    points = PointMap(rng, 300, 6)
-    points.fill()
+    points = filled(rng, 300, 6)
     last = points.keyframes[5]
     held = last.anchor.copy()
     points.map.forget_observations(last, last.keypoints_with_anchor())
@@ -78,8 +77,7 @@ def test_of_duplicates_the_better_observed_anchor_is_kept(rng):
 @pytest.mark.parametrize(("off_px", "found"), [(2.2, True), (2.8, False)])
 def test_a_distance_above_the_95_percent_quantile_is_no_duplicate(rng, off_px, found):
     """Two degrees of freedom, one pixel: 2.45 px."""
-    points = PointMap(rng, 300, 4)
-    points.fill()
+    points = filled(rng, 300, 4)
     last = points.keyframes[3]
     held = last.anchor.copy()
     points.map.forget_observations(last, last.keypoints_with_anchor())

@@ -1,15 +1,12 @@
 """The refinement of the whole map with its edges, for every setting."""
 
-import pickle
-from functools import lru_cache
-
 import numpy as np
 import pytest
-from pickled import pickled
+from flown import flown, true_poses
 from point_map import check_map
-from rendered import CAMERA, film, sideways, stairs_world
+from rendered import CAMERA
 
-from edgeslam_torch.config import DepthConfig, SlamConfig, WindowConfig
+from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
@@ -18,7 +15,6 @@ from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
 from edgeslam_torch.mapping.motion_terms import MotionFactors
 from edgeslam_torch.optim.problem import StopReason, WindowResult
-from edgeslam_torch.slam import EdgeSlam
 
 POINTS = WindowConfig(alignment=False, cycle="off")
 FORMS = {
@@ -35,25 +31,15 @@ FORMS = {
 }
 
 
-@lru_cache(maxsize=1)
-def flight() -> tuple[bytes, np.ndarray]:
-    """State after 30 images past panels at many depths, nothing refined after the last; and the true poses."""
-    filmed = film(stairs_world(), CAMERA, sideways(30, 0.03, turn_rad=0.004))
-    slam = EdgeSlam(CAMERA, SlamConfig(depth=DepthConfig(weights="none")))
-    for frame in filmed.frames:
-        slam.step(frame)
-    return pickled((slam.map, slam.edges, slam.log)), filmed.T_w_c
-
-
 def finish(config: WindowConfig) -> tuple[SlamMap, EdgeMap, TrajectoryLog, WindowResult]:
-    slam_map, edges, log = pickle.loads(flight()[0])
+    slam_map, edges, log = flown()
     result = last_refinement(slam_map, CAMERA, edges, config)
     assert result is not None
     return slam_map, edges, log, result
 
 
 def ate(log: TrajectoryLog) -> float:
-    T_w_c, truth = log.poses()[1], flight()[1]
+    T_w_c, truth = log.poses()[1], true_poses()
     aligned = umeyama(T_w_c[:, :3, 3], truth[:, :3, 3]).points(T_w_c[:, :3, 3])
     return float(np.sqrt(np.square(aligned - truth[:, :3, 3]).sum(1).mean()))
 
@@ -81,7 +67,7 @@ def test_edges_are_refined_and_their_depths_written_back():
 
 def test_edges_measured_at_another_scale_follow_the_map():
     """As after a turn: the refinement of the anchors changes the scale of what was measured before it."""
-    slam_map, edges, log = pickle.loads(flight()[0])
+    slam_map, edges, log = flown()
     for host in edges.hosts:  # measured when everything was nearer
         host.grow(0.8)
     last_refinement(slam_map, CAMERA, edges, WindowConfig())
@@ -93,7 +79,7 @@ def test_edges_measured_at_another_scale_follow_the_map():
 
 def test_edges_measured_with_wrong_poses_are_measured_again():
     """Half as far as the anchors of that time had them, and these have moved since: no common factor mends that."""
-    slam_map, edges, log = pickle.loads(flight()[0])
+    slam_map, edges, log = flown()
     for host in edges.hosts[::2]:
         host.grow(0.8)
         host.p_c *= 0.5
@@ -107,13 +93,13 @@ def test_edges_measured_with_wrong_poses_are_measured_again():
 
 
 def test_without_reprojection_anchors_are_unchanged():
-    start, _, _ = pickle.loads(flight()[0])
+    start, _, _ = flown()
     slam_map, _, _, _ = finish(FORMS["no reprojection"])
     np.testing.assert_allclose(slam_map.anchors.p_w, start.anchors.p_w, rtol=0, atol=1e-12)
 
 
 def test_a_non_finite_anchor_skips_the_refinement_and_preserves_the_map():
-    slam_map, edges, log = pickle.loads(flight()[0])
+    slam_map, edges, log = flown()
     held = int(slam_map.latest().anchor.max())
     slam_map.anchors.p_w[held] = np.nan
     before = log.poses()[1]
@@ -125,7 +111,7 @@ def test_a_non_finite_anchor_skips_the_refinement_and_preserves_the_map():
 
 def test_the_last_refinement_uses_the_full_weight_of_telemetry(monkeypatch):
     """Thirty times, as in flight, bends what is straight."""
-    flight()
+    flown()
     asked = []
 
     def factors(model, keyframes, piece, doubt, effective_samples):

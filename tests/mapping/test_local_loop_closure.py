@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from point_map import CAMERA, PointMap, check_map, small_motion
+from point_map import CAMERA, PointMap, check_map, filled, small_motion
 
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import words
@@ -84,16 +84,14 @@ def test_a_different_place_is_not_matched(rng, drift):
 
 
 def test_covisible_keyframes_are_skipped(rng):
-    points = PointMap(rng, 300, 4)
-    points.fill()
+    points = filled(rng, 300, 4)
     assert revisit_candidate(points.map, points.keyframes[0]) is None, "none is older"
     assert all(reobserve(points.map, CAMERA, keyframe) is None for keyframe in points.keyframes)
     check_map(points.map)
 
 
 def test_keyframe_without_anchors_has_no_revisit_candidate(rng):
-    points = PointMap(rng, 300, 3)
-    points.fill()
+    points = filled(rng, 300, 3)
     points.map.forget_observations(points.keyframes[2], points.keyframes[2].keypoints_with_anchor())
     assert revisit_candidate(points.map, points.keyframes[2]) is None
 

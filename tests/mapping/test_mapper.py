@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from point_map import CAMERA, PointMap, check_map, small_motion
+from point_map import CAMERA, PointMap, check_map, filled, small_motion
 
 from edgeslam_torch.config import MappingConfig, SlamConfig
 from edgeslam_torch.frontend.matching import words
@@ -107,8 +107,7 @@ def test_a_full_map_removes_keyframes_outside_the_window(rng, monkeypatch):
 
 def test_the_only_views_of_a_place_are_kept_in_a_full_map(rng, monkeypatch):
     """Two cameras share a place that no other one sees; the others see what others see, too."""
-    points = PointMap(rng, 600, 30)
-    points.fill()
+    points = filled(rng, 600, 30)
     home = {0, 1}
     theirs = points.map.anchors_seen_by([points.keyframes[i] for i in home])[::2]
     for keyframe in points.keyframes:
@@ -122,8 +121,7 @@ def test_the_only_views_of_a_place_are_kept_in_a_full_map(rng, monkeypatch):
 
 
 def test_a_map_of_unique_views_grows_to_twice_the_limit(rng, monkeypatch):
-    points = PointMap(rng, 900, 30)
-    points.fill()
+    points = filled(rng, 900, 30)
     for keyframe in points.keyframes:  # each anchor is left to two neighbours
         others = keyframe.anchor % 15 != keyframe.id // 2
         points.map.forget_observations(keyframe, np.flatnonzero((keyframe.anchor >= 0) & others))

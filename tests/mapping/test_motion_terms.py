@@ -6,7 +6,7 @@ from functools import reduce
 
 import numpy as np
 import pytest
-from point_map import CAMERA, PointMap, check_map
+from point_map import CAMERA, check_map, filled
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -37,11 +37,8 @@ T_B_C = camera_on_body()
 @pytest.fixture
 def halves(rng):
     """Six keyframes, one a second: the first three share no anchor with the last three."""
-    points = PointMap(rng, 400, 6)
-    points.fill()
-    for keyframe in points.keyframes:
-        other = np.flatnonzero((keyframe.anchor >= 0) & (keyframe.anchor % 2 != (keyframe.id >= 3)))
-        points.map.forget_observations(keyframe, other)
+    points = filled(rng, 400, 6)
+    points.part(lambda number: number >= 3)
     return points
 
 
@@ -104,11 +101,8 @@ def test_the_recent_map_corrects_a_drift_that_a_window_preserves(rng, halves):
 @pytest.mark.parametrize("most", [16, 60])
 def test_correcting_a_drift_preserves_the_scale_of_older_keyframes(rng, most):
     """The newest keyframes are half as large again: they shrink, and the older ones do not grow towards them."""
-    points, split = PointMap(rng, 600, 20), 14
-    points.fill()
-    for keyframe in points.keyframes:
-        other = np.flatnonzero((keyframe.anchor >= 0) & (keyframe.anchor % 2 != (keyframe.id >= split)))
-        points.map.forget_observations(keyframe, other)
+    points, split = filled(rng, 600, 20), 14
+    points.part(lambda number: number >= split)
     old, new = spread_of(points, 20 - most if most < 20 else 0, 10), spread_of(points, split, 20)
     blow_up(points, 1.5, split)
     window = recent_map(points.map, points.keyframes[-1], most)
@@ -124,12 +118,8 @@ def test_correcting_a_drift_preserves_the_scale_of_older_keyframes(rng, most):
 @pytest.fixture
 def there_and_back(rng):
     """Twelve keyframes: the first and the last four see the same half of the room, those between the other half."""
-    points = PointMap(rng, 600, 12)
-    points.fill()
-    for keyframe in points.keyframes:
-        between = 4 <= keyframe.id < 8
-        other = np.flatnonzero((keyframe.anchor >= 0) & (keyframe.anchor % 2 != between))
-        points.map.forget_observations(keyframe, other)
+    points = filled(rng, 600, 12)
+    points.part(lambda number: 4 <= number < 8)
     return points
 
 
@@ -208,14 +198,11 @@ def test_two_keyframes_or_a_static_camera_are_no_recent_map(halves):
 @pytest.mark.parametrize("metres", [True, False])
 def test_every_second_the_recent_map_is_refined_with_telemetry(rng, metres):
     """Keyframes that hold a drifted scale are beyond the window of two and its two fixed ones."""
-    points = PointMap(rng, 600, 12)
-    points.fill()
+    points = filled(rng, 600, 12)
     model = telemetry_of(rng, points)
     model = model if metres else replace(model, velocity=False, scale_sigma_log=np.inf)
     split = 4
-    for keyframe in points.keyframes:
-        other = np.flatnonzero((keyframe.anchor >= 0) & (keyframe.anchor % 2 != (keyframe.id >= split)))
-        points.map.forget_observations(keyframe, other)
+    points.part(lambda number: number >= split)
     blow_up(points, 1.4, split)
     config = SlamConfig(mapping=MappingConfig(window=2, window_fixed=2))
     mapper = Mapper(points.map, CAMERA, config, lm_config(config.window))
@@ -250,17 +237,6 @@ def test_poses_come_in_any_order(rng, halves):
     model, shuffled = telemetry_of(rng, halves), [halves.keyframes[i] for i in (4, 0, 5, 2, 1, 3)]
     (factor,) = motion_factors(model, shuffled, [0] * 6).centres
     assert [shuffled[i].id for i in factor.pose] == [0, 1, 2, 3, 4, 5]
-
-
-def tilted(points, angle_rad):
-    """The last three keyframes and their anchors, turned about a level axis through the third."""
-    R, centre = Rotation.from_rotvec([0.0, angle_rad, 0.0]).as_matrix(), points.keyframes[2].centre_w
-    for keyframe in points.keyframes[3:]:
-        T_w_c = keyframe.T_w_c
-        T_w_c[:3, :3], T_w_c[:3, 3] = R @ T_w_c[:3, :3], centre + R @ (T_w_c[:3, 3] - centre)
-        keyframe.T_c_w = se3.inverse(T_w_c)
-    mine = points.map.anchors_seen_by(points.keyframes[3:])
-    points.map.anchors.p_w[mine] = centre + (points.map.anchors.p_w[mine] - centre) @ R.T
 
 
 def tilt_deg(points):
@@ -301,15 +277,20 @@ def heading_deg(points, first=3):
     return float(np.degrees(np.mean(Rotation.from_matrix(np.array(off)).as_rotvec()[:, 2])))
 
 
-def test_headings_need_a_metric_scale_and_valid_attitude(rng, halves):
+def test_factors_are_those_that_telemetry_determines(rng, halves):
     model = telemetry_of(rng, halves)
-    assert motion_factors(model, halves.keyframes, [0] * 6).headings
-    for silent in (replace(model, attitude=False), replace(model, scale_sigma_log=np.inf, velocity=False)):
-        assert not motion_factors(silent, halves.keyframes, [0] * 6).headings
+    for told, expected in (
+        (model, {"centres", "gravity", "headings"}),
+        (replace(model, attitude=False), {"centres"}),
+        (replace(model, scale_sigma_log=np.inf, velocity=False), {"gravity"}),
+        (None, set()),
+    ):
+        factors = motion_factors(told, halves.keyframes, [0] * 6)
+        assert {name for name in ("centres", "gravity", "headings") if getattr(factors, name)} == expected
 
 
 def test_gravity_alone_levels_an_unconstrained_map(rng, halves):
-    tilted(halves, 0.2)
+    turned_about(halves, [0.0, 0.2, 0.0])
     assert tilt_deg(halves) > 10.0
     model = replace(telemetry_of(rng, halves), velocity=False)
     assert not motion_factors(model, halves.keyframes, [0] * 6).centres
@@ -350,22 +331,10 @@ def test_a_whole_map_may_use_the_full_weight_of_telemetry(rng, halves):
     np.testing.assert_allclose(30.0 * one.headings[0].information, often.headings[0].information)
 
 
-def test_invalid_attitude_gives_no_gravity(rng, halves):
-    model = replace(telemetry_of(rng, halves), attitude=False)
-    factors = motion_factors(model, halves.keyframes, [0] * 6)
-    assert factors.centres and not factors.gravity
-
-
-def test_no_telemetry_no_factors(halves):
-    factors = motion_factors(None, halves.keyframes, [0] * 6)
-    assert not factors.centres and not factors.gravity and not factors.headings
-
-
 @pytest.mark.parametrize("metres", [1.0, 0.2])
 def test_a_weakly_connected_keyframe_stays_at_a_plausible_pose(rng, metres):
     """The first of six, a fifth of a second apart: nothing else sees what it shares with the second one."""
-    points = PointMap(rng, 400, 6)
-    points.fill()
+    points = filled(rng, 400, 6)
     first, second, *rest = points.keyframes
     shared = np.intersect1d(first.anchor[first.anchor >= 0], second.anchor[second.anchor >= 0])
     for keyframe in points.keyframes:

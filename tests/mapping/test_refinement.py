@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from point_map import CAMERA, PointMap, check_map, small_motion
+from point_map import CAMERA, check_map, filled, small_motion
 
 from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.geometry import se3
@@ -22,9 +22,7 @@ from edgeslam_torch.optim.problem import LmConfig, StopReason
 
 @pytest.fixture
 def points(rng):
-    made = PointMap(rng, 300, 6)
-    made.fill()
-    return made
+    return filled(rng, 300, 6)
 
 
 def pose_errors(points, keyframes):
@@ -137,8 +135,7 @@ def test_a_wide_window_is_written_back_only_if_converged(points, rng):
 
 
 def test_a_window_of_two_keyframes_keeps_its_scale(rng):
-    points = PointMap(rng, 100, 2)
-    points.fill()
+    points = filled(rng, 100, 2)
     a, b = points.keyframes
     window = choose_window(points.map, b, 10, 15)
     assert ([k.id for k in window.free], [k.id for k in window.fixed]) == ([b.id], [a.id])
@@ -188,8 +185,7 @@ def test_the_scale_of_a_loaded_map_is_preserved(points):
 
 
 def test_map_of_two_keyframes_is_not_refined(rng):
-    points = PointMap(rng, 100, 2)
-    points.fill()
+    points = filled(rng, 100, 2)
     assert refine_all(points.map, CAMERA, LmConfig()) is None
 
 
@@ -230,8 +226,7 @@ def median_depth(points):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_new_map_of_a_wrong_shape_is_corrected(seed):
     """Where one pose and one distance are held, and the solver does not stop early."""
-    points = PointMap(np.random.default_rng(seed), 300, 6, noise_px=0.3)
-    points.fill()
+    points = filled(np.random.default_rng(seed), 300, 6, noise_px=0.3)
     bend(points)
     assert worst_turn_deg(points) > 1.0
     before = median_depth(points)

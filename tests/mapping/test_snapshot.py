@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from point_map import CAMERA, PointMap
+from point_map import CAMERA, filled
 
 from edgeslam_torch.config import DepthConfig, EdgeConfig, SlamConfig
 from edgeslam_torch.geometry import se3
@@ -33,9 +33,7 @@ def beside(lock, work):
 
 @pytest.fixture
 def points(rng):
-    made = PointMap(rng, 300, 3)
-    made.fill()
-    return made
+    return filled(rng, 300, 3)
 
 
 @pytest.fixture

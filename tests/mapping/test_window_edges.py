@@ -1,38 +1,19 @@
 """Edges in the windows while flying: where they take part, whose edges, and what comes back."""
 
-import pickle
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 import pytest
-from pickled import pickled
-from rendered import CAMERA, film, sideways, stairs_world
+from flown import flown
+from rendered import CAMERA
 
-from edgeslam_torch.config import DepthConfig, SlamConfig, WindowConfig
-from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.refinement import choose_window, refine, window_problem
 from edgeslam_torch.mapping.window_edges import FEW_ANCHORS, WindowEdges, term_config
 from edgeslam_torch.optim.problem import LmConfig
-from edgeslam_torch.slam import EdgeSlam
 
 ALWAYS = WindowConfig(in_flight="always")
-
-
-@lru_cache(maxsize=1)
-def flown() -> bytes:
-    filmed = film(stairs_world(), CAMERA, sideways(30, 0.03, turn_rad=0.004))
-    slam = EdgeSlam(CAMERA, SlamConfig(depth=DepthConfig(weights="none")))
-    for frame in filmed.frames:
-        slam.step(frame)
-    return pickled((slam.map, slam.edges))
-
-
-def state() -> tuple[SlamMap, EdgeMap]:
-    slam_map, edges = pickle.loads(flown())
-    edges.map = slam_map
-    return slam_map, edges
 
 
 def flying(edges: EdgeMap, config: WindowConfig = ALWAYS) -> WindowEdges:
@@ -42,7 +23,7 @@ def flying(edges: EdgeMap, config: WindowConfig = ALWAYS) -> WindowEdges:
 
 
 def test_edges_are_used_with_few_corners():
-    slam_map, edges = state()
+    slam_map, edges, _ = flown()
     rich = slam_map.latest()
     assert np.count_nonzero(rich.anchor >= 0) >= FEW_ANCHORS
     assert not rich.features.faint
@@ -55,7 +36,7 @@ def test_edges_are_used_with_few_corners():
 
 
 def test_free_keyframes_have_edges_and_unmeasured_ones_are_targets():
-    slam_map, edges = state()
+    slam_map, edges, _ = flown()
     window = choose_window(slam_map, slam_map.latest(), 4, 15)
     keyframes = [*window.free, *window.fixed]
     measured = {h.keyframe_id for h in edges.hosts}
@@ -77,7 +58,7 @@ def test_free_keyframes_have_edges_and_unmeasured_ones_are_targets():
 def test_a_disturbed_pose_is_recovered_by_edges_alone():
     left = []
     for axis, by in ((0, 0.01), (0, -0.01), (1, 0.01), (1, -0.01)):
-        slam_map, edges = state()
+        slam_map, edges, _ = flown()
         window = choose_window(slam_map, slam_map.latest(), 4, 15)
         moved = next(k for k in window.free if k.id in {h.keyframe_id for h in edges.hosts})
         true = moved.T_c_w.copy()
@@ -95,7 +76,7 @@ def test_a_disturbed_pose_is_recovered_by_edges_alone():
 
 
 def test_depths_are_written_back_and_updated():
-    slam_map, edges = state()
+    slam_map, edges, _ = flown()
     window = choose_window(slam_map, slam_map.latest(), 4, 15)
     terms, depth = flying(edges), {h.keyframe_id: h.p_c[:, 2].copy() for h in edges.hosts}
     for _ in range(2):

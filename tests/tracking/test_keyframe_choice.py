@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from point_map import CAMERA, PointMap
+from point_map import CAMERA, filled
 
 from edgeslam_torch.config import MappingConfig
 from edgeslam_torch.geometry import se3
@@ -19,9 +19,7 @@ SOON_S = 5.0 + 0.5 * (OLD_S + LONG_AGO_S)
 
 @pytest.fixture(scope="module")
 def visited():
-    points = PointMap(np.random.default_rng(3), 1500, 6)
-    points.fill()
-    return points
+    return filled(np.random.default_rng(3), 1500, 6)
 
 
 def again(points, view=2, T_c_w=None):
@@ -48,8 +46,7 @@ def test_a_recent_view_is_no_earlier_visit(visited):
 
 
 def test_a_loaded_map_is_an_earlier_visit():
-    points = PointMap(np.random.default_rng(3), 1500, 6)
-    points.fill()
+    points = filled(np.random.default_rng(3), 1500, 6)
     for keyframe in points.keyframes:
         keyframe.stamp_s = -math.inf
     assert share(points, *again(points), stamp_s=0.0) > 0.95
@@ -108,15 +105,13 @@ def test_a_part_without_any_matches_has_changed(visited):
 
 
 def test_predicted_depths_are_not_covered():
-    points = PointMap(np.random.default_rng(3), 1500, 6)
-    points.fill()
+    points = filled(np.random.default_rng(3), 1500, 6)
     points.map.anchors.from_depth[:] = True
     assert share(points, *again(points)) == 0.0
 
 
 def test_a_half_with_predicted_depths_is_not_covered():
-    points = PointMap(np.random.default_rng(3), 1500, 6)
-    points.fill()
+    points = filled(np.random.default_rng(3), 1500, 6)
     track, uv = again(points)
     points.map.anchors.from_depth[track.anchor[uv[track.keypoint, 0] < 0.5 * CAMERA.width]] = True
     assert 0.3 < share(points, track, uv) < 0.7

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from point_map import CAMERA, SCALE_FACTOR, PointMap
+from point_map import CAMERA, SCALE_FACTOR, PointMap, filled
 
 from edgeslam_torch.config import OrbConfig, TrackingConfig
 from edgeslam_torch.frontend.matching import words
@@ -28,9 +28,7 @@ NOWHERE = Reach(se3.exp(np.array([50.0, 0, 0, 0, 0, 0])), 1.0, 0.1)
 
 @pytest.fixture
 def points(rng):
-    made = PointMap(rng, 2000, 6)
-    made.fill()
-    return made
+    return filled(rng, 2000, 6)
 
 
 def tracker_of(points):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from point_map import CAMERA, SCALE_FACTOR, PointMap, small_motion
+from point_map import CAMERA, SCALE_FACTOR, filled, small_motion
 
 from edgeslam_torch.config import OrbConfig, TrackingConfig
 from edgeslam_torch.geometry import se3
@@ -16,9 +16,7 @@ from edgeslam_torch.types import FrameFeatures
 
 @pytest.fixture
 def points(rng):
-    made = PointMap(rng, 400, 6)
-    made.fill()
-    return made
+    return filled(rng, 400, 6)
 
 
 def tracker_of(points, **settings):
