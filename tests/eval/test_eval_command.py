@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from markdown_rows import row, rows
+from summaries import with_summary
 
 from edgeslam_torch.commands import report as report_command
 from edgeslam_torch.commands.judging import compare as compare_command
@@ -46,8 +47,7 @@ def own_recording(run_dir, truth):
     folder = run_dir.parent / f"recording of {run_dir.name}"
     folder.mkdir()
     truth.rename(folder / "groundtruth.txt")
-    summary = json.loads((run_dir / "summary.json").read_text())
-    (run_dir / "summary.json").write_text(json.dumps(summary | {"source": str(folder)}))
+    with_summary(run_dir, source=str(folder))
 
 
 def test_a_run_is_judged_by_the_truth_of_its_recording(run_folder, tmp_path, capsys):

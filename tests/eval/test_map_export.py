@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from summaries import with_summary
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.commands import export_map
@@ -169,6 +170,14 @@ def test_grid_without_sight_lines_is_free_where_the_camera_was():
     assert np.count_nonzero(grid.cells == FREE) == 1
 
 
+@pytest.fixture
+def run(run_folder, tmp_path):
+    """A run's folder with its camera."""
+    run_folder(tmp_path / "a")
+    save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
+    return tmp_path / "a"
+
+
 def export(*words):
     parser = argparse.ArgumentParser()
     export_map.add_arguments(parser)
@@ -176,62 +185,47 @@ def export(*words):
 
 
 @pytest.mark.parametrize("form", [form for form in export_map.FORMATS if form != "nerfstudio"])
-def test_command_writes_every_format(form, run_folder, tmp_path):
-    run_folder(tmp_path / "a")
-    save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
-    before = set((tmp_path / "a").rglob("*"))
-    assert export(tmp_path / "a", "--format", form, "--max-sigma", 0.05) == 0
-    assert set((tmp_path / "a").rglob("*")) > before
+def test_command_writes_every_format(form, run):
+    before = set(run.rglob("*"))
+    assert export(run, "--format", form, "--max-sigma", 0.05) == 0
+    assert set(run.rglob("*")) > before
 
 
-def test_nerfstudio_without_images_says_so(run_folder, tmp_path):
-    run_folder(tmp_path / "a")
-    save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
+def test_nerfstudio_without_images_says_so(run):
     with pytest.raises(EdgeSlamError, match=r"images of the keyframes are not there; .*--keep-images"):
-        export(tmp_path / "a", "--format", "nerfstudio")
+        export(run, "--format", "nerfstudio")
 
 
 @pytest.mark.parametrize("options", [[], ["--overwrite"]])
-def test_nerfstudio_replaces_no_picture_of_the_recording(options, run_folder, tmp_path):
-    run_folder(tmp_path / "a")
-    summary = json.loads((tmp_path / "a" / "summary.json").read_text())
-    (tmp_path / "a" / "summary.json").write_text(json.dumps(summary | {"source": {"path": "../flight"}}))
+def test_nerfstudio_replaces_no_picture_of_the_recording(options, run, tmp_path):
+    with_summary(run, source={"path": "../flight"})
     picture = tmp_path / "flight" / "images" / "00001.png"
     picture.parent.mkdir(parents=True)
     picture.touch()
     with pytest.raises(OutputError, match="give another file to --out"):
-        export(tmp_path / "a", "--format", "nerfstudio", "--out", tmp_path / "flight", *options)
+        export(run, "--format", "nerfstudio", "--out", tmp_path / "flight", *options)
 
 
-def test_occupancy_needs_metres(run_folder, tmp_path):
-    run_folder(tmp_path / "a")
-    path = tmp_path / "a" / "summary.json"
-    summary = json.loads(path.read_text())
-    summary["scale"]["units"] = "arbitrary"
-    path.write_text(json.dumps(summary))
+def test_occupancy_needs_metres(run):
+    with_summary(run, scale={"value": 1.0, "sigma": 0.03, "units": "arbitrary"})
     with pytest.raises(EdgeSlamError, match="metric scale"):
-        export(tmp_path / "a", "--format", "occupancy")
+        export(run, "--format", "occupancy")
 
 
 @pytest.mark.parametrize("up", [None, {"source": "unknown", "sigma_deg": None}])
-def test_occupancy_of_a_possibly_tilted_map_needs_an_option(up, run_folder, tmp_path):
-    run_folder(tmp_path / "a")
-    path = tmp_path / "a" / "summary.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "up": up}))
+def test_occupancy_of_a_possibly_tilted_map_needs_an_option(up, run):
+    with_summary(run, up=up)
     with pytest.raises(EdgeSlamError, match="--z-is-up"):
-        export(tmp_path / "a", "--format", "occupancy")
-    assert export(tmp_path / "a", "--format", "occupancy", "--z-is-up") == 0
-    path.write_text(json.dumps({**json.loads(path.read_text()), "up": {"source": "edges", "sigma_deg": 2.0}}))
-    assert export(tmp_path / "a", "--format", "occupancy") == 0
+        export(run, "--format", "occupancy")
+    assert export(run, "--format", "occupancy", "--z-is-up") == 0
+    with_summary(run, up={"source": "edges", "sigma_deg": 2.0})
+    assert export(run, "--format", "occupancy") == 0
 
 
-@pytest.mark.parametrize("scale", ["null", "{}", None], ids=["null", "empty", "no summary"])
-def test_unknown_units_are_said(scale, run_folder, tmp_path, capsys):
-    run_folder(tmp_path / "a")
-    (tmp_path / "a" / "summary.json").unlink()
-    if scale is not None:
-        (tmp_path / "a" / "summary.json").write_text(f'{{"scale": {scale}}}')
-    assert export(tmp_path / "a", "--format", "ply") == 0
+@pytest.mark.parametrize("summary", ['{"scale": null}', '{"scale": {}}', "{}"])
+def test_unknown_units_are_said(summary, run, capsys):
+    (run / "summary.json").write_text(summary)
+    assert export(run, "--format", "ply") == 0
     assert "the folder does not say" in capsys.readouterr().out
 
 
@@ -255,15 +249,11 @@ KNOWN = {"source": "edges", "sigma_deg": 1.24}
         *[("ply", "", up) for up in (KNOWN, {"source": "unknown", "sigma_deg": None}, {"source": 3, "sigma_deg": "x"})],
     ],
 )
-def test_every_exported_map_says_whether_z_is_up(run_folder, tmp_path, capsys, form, file, up):
+def test_every_exported_map_says_whether_z_is_up(run, tmp_path, capsys, form, file, up):
     if form == "las":
         pytest.importorskip("laspy")
-    run_folder(tmp_path / "run", points=100)
-    save_camera(tmp_path / "run" / "camera.yaml", PRESETS["tum_fr1"])
-    summary = tmp_path / "run" / "summary.json"
-    summary.write_text(json.dumps({**json.loads(summary.read_text()), "up": up}))
     said = "z up by edges, sigma 1.2 degrees" if up is KNOWN else "up is not known"
-    assert main(["export-map", str(tmp_path / "run"), "--format", form, "-o", str(tmp_path / "out")]) == 0
+    assert export(with_summary(run, up=up), "--format", form, "--out", tmp_path / "out") == 0
     assert said in capsys.readouterr().out
     assert said.encode() in (tmp_path / "out" / file if file else tmp_path / "out").read_bytes()[:10000]
 
@@ -286,8 +276,6 @@ def test_sight_above_the_heights_frees_nothing():
     assert value_at(grid, 1.0, 0.0) == UNKNOWN
 
 
-def test_run_without_observations_has_points_without_images(run_folder, tmp_path, capsys):
-    run_folder(tmp_path / "a")
-    save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
-    assert export(tmp_path / "a", "--format", "colmap") == 0
+def test_run_without_observations_has_points_without_images(run, capsys):
+    assert export(run, "--format", "colmap") == 0
     assert "points are not linked to images" in capsys.readouterr().out

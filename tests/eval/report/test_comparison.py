@@ -1,6 +1,5 @@
 """Two runs side by side."""
 
-import json
 import re
 import shutil
 from html.parser import HTMLParser
@@ -8,6 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from browser import PROGRAM, Browser
+from summaries import with_summary
 
 from edgeslam_torch import cli
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory, write_tum
@@ -51,8 +51,7 @@ def _changed(folder, turn=0.7, size=2.0, **summary):
     T[:, :3, :3] = R @ T[:, :3, :3]
     T[:, :3, 3] = size * T[:, :3, 3] @ R.T + [5.0, -3.0, 1.0]
     write_tum(Trajectory(run.stamps_s, T, "b"), folder / "trajectory.txt")
-    known = json.loads((folder / "summary.json").read_text())
-    (folder / "summary.json").write_text(json.dumps(known | summary))
+    with_summary(folder, **summary)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 import pytest
+from summaries import with_summary
 
 from edgeslam_torch import open_source
 from edgeslam_torch.eval.inputs.run_folder import open_run
@@ -48,12 +49,6 @@ class Page(HTMLParser):
 
     def handle_data(self, data):
         self.text[self._in] = self.text.get(self._in, "") + data
-
-
-def with_summary(folder, **changes):
-    file = folder / "summary.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
-    return folder
 
 
 @pytest.fixture
