@@ -178,6 +178,7 @@ def test_nor_is_a_home_needed(source, monkeypatch):
     assert imported(source).filled(1) == [2.0]
 
 
+@pytest.mark.slow
 def test_two_processes_at_once_share_a_cache(source):
     code = "import sys; sys.path.insert(0, sys.argv[1]); from loops import filled; print(filled(2))"
     command = [sys.executable, "-c", code, str(source.parent)]

@@ -47,7 +47,7 @@ def recordings(tmp_path_factory):
 def finetune(recordings, tmp_path):
     """Runs the command on named recordings into ``tmp_path/out``; returns exit code, stdout and stderr."""
 
-    def call(*words, steps=8, out=tmp_path / "out"):
+    def call(*words, steps=4, out=tmp_path / "out"):
         return _finetune(recordings, *words, steps=steps, out=out)
 
     return call
@@ -64,18 +64,18 @@ def _finetune(recordings, *words, steps, out):
 
 
 @pytest.fixture(scope="module")
-def eight_steps(recordings):
+def four_steps(recordings):
     """A whole run on the kitchen, shared by the tests, and its output."""
-    folder = recordings / "eight steps"
-    code, stdout, _ = _finetune(recordings, "kitchen", steps=8, out=folder)
+    folder = recordings / "four steps"
+    code, stdout, _ = _finetune(recordings, "kitchen", steps=4, out=folder)
     assert code == 0
     return folder, stdout
 
 
 @pytest.fixture
-def trained(eight_steps, tmp_path):
+def trained(four_steps, tmp_path):
     """A copy of that run in ``tmp_path/out``."""
-    return Path(shutil.copytree(eight_steps[0], tmp_path / "out"))
+    return Path(shutil.copytree(four_steps[0], tmp_path / "out"))
 
 
 def contents(folder):
@@ -135,8 +135,8 @@ def test_data_that_changed_on_disk_is_refused(finetune, recordings, tmp_path):
     assert contents(tmp_path / "out") == before
 
 
-def test_same_command_again_trains_nothing_and_says_so(finetune, eight_steps, trained, tmp_path):
-    first = eight_steps[1].replace(str(eight_steps[0]), str(trained))
+def test_same_command_again_trains_nothing_and_says_so(finetune, four_steps, trained, tmp_path):
+    first = four_steps[1].replace(str(four_steps[0]), str(trained))
     before = contents(tmp_path / "out")
     code, second, _ = finetune("kitchen")
     assert code == 0
@@ -146,28 +146,28 @@ def test_same_command_again_trains_nothing_and_says_so(finetune, eight_steps, tr
 
 
 def test_more_steps_go_on_and_fewer_are_refused(finetune, trained, tmp_path):
-    code, stdout, _ = finetune("kitchen", steps=12)
+    code, stdout, _ = finetune("kitchen", steps=6)
     assert code == 0
-    assert "resumes after step 8" in stdout
-    assert saved_step(tmp_path / "out" / "last.pt") == 12
+    assert "resumes after step 4" in stdout
+    assert saved_step(tmp_path / "out" / "last.pt") == 6
     curve = [json.loads(line)["step"] for line in (tmp_path / "out" / "curve.jsonl").read_text().splitlines()]
-    assert curve == [*range(9), *range(9, 13)]
-    refused(finetune("kitchen", steps=6), "has 12 steps already, so it cannot end after 6")
+    assert curve == [*range(5), *range(5, 7)]
+    refused(finetune("kitchen", steps=3), "has 6 steps already, so it cannot end after 3")
     sessions = json.loads((tmp_path / "out" / "finetune.json").read_text())["sessions"]
-    assert [(s["from_step"], s["steps"]) for s in sessions] == [(0, 8), (8, 12)]
+    assert [(s["from_step"], s["steps"]) for s in sessions] == [(0, 4), (4, 6)]
 
 
 @pytest.mark.slow
 def test_resume_takes_another_rate_and_needs_something_to_resume(finetune, trained, tmp_path):
     refused(finetune("kitchen", "--resume", out=tmp_path / "new"), "nothing to resume")
     assert not (tmp_path / "new").exists()
-    refused(finetune("kitchen", "--lr", "0.001", steps=10), "lr: 0.01 then, 0.001 now", "--resume")
-    assert finetune("kitchen", "--lr", "0.001", "--resume", steps=10)[0] == 0
+    refused(finetune("kitchen", "--lr", "0.001", steps=6), "lr: 0.01 then, 0.001 now", "--resume")
+    assert finetune("kitchen", "--lr", "0.001", "--resume", steps=6)[0] == 0
 
 
 @pytest.mark.slow
 def test_overwrite_begins_anew_and_keeps_the_old_one_until_the_data_is_read(finetune, tmp_path):
-    finetune("kitchen", steps=10)
+    finetune("kitchen", steps=6)
     before = contents(tmp_path / "out")
     broken = write_folder(tmp_path / "broken", 2)
     (broken / "depth.txt").write_text("5.0 depth/0.png\n")
@@ -175,7 +175,7 @@ def test_overwrite_begins_anew_and_keeps_the_old_one_until_the_data_is_read(fine
     assert contents(tmp_path / "out") == before
     assert finetune("hall", "--overwrite")[0] == 0
     assert load_checkpoint(tmp_path / "out" / "weights.safetensors")[1].data == ("rooms", "hall")
-    assert saved_step(tmp_path / "out" / "last.pt") == 8
+    assert saved_step(tmp_path / "out" / "last.pt") == 4
 
 
 def test_files_that_no_finetuning_wrote_are_left_alone(finetune, recordings, tmp_path):
@@ -241,9 +241,9 @@ def test_what_made_nothing_better_keeps_the_weights_it_began_with(finetune, reco
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_signal_says_what_is_kept_and_the_same_command_goes_on(finetune, eight_steps, tmp_path, monkeypatch, number):
+def test_signal_says_what_is_kept_and_the_same_command_goes_on(finetune, four_steps, tmp_path, monkeypatch, number):
     def stopped(self, state, losses):
-        if state.step == 5:
+        if state.step == 3:
             signal.raise_signal(number)
 
     before = signal.getsignal(number)
@@ -252,9 +252,9 @@ def test_signal_says_what_is_kept_and_the_same_command_goes_on(finetune, eight_s
         code, _, stderr = finetune("kitchen")
     assert code == 130
     assert signal.getsignal(number) is before
-    assert stderr.splitlines()[-1].endswith("holds step 5, and the same command resumes from there")
-    whole, resumed = eight_steps[0], tmp_path / "out"
-    assert "resumes after step 5" in finetune("kitchen")[1]
+    assert stderr.splitlines()[-1].endswith("holds step 3, and the same command resumes from there")
+    whole, resumed = four_steps[0], tmp_path / "out"
+    assert "resumes after step 3" in finetune("kitchen")[1]
     for name in ("weights.safetensors", "final.safetensors", "curve.jsonl"):
         assert (whole / name).read_bytes() == (resumed / name).read_bytes(), name
 
@@ -290,9 +290,9 @@ def test_moved_data_and_folder_go_on(finetune, recordings, tmp_path):
     finetune(str(folder), out=tmp_path / "first")
     shutil.move(tmp_path / "here", tmp_path / "there")
     shutil.move(tmp_path / "first", tmp_path / "second")
-    code, stdout, _ = finetune(str(tmp_path / "there" / "kitchen"), out=tmp_path / "second", steps=10)
+    code, stdout, _ = finetune(str(tmp_path / "there" / "kitchen"), out=tmp_path / "second", steps=6)
     assert code == 0
-    assert "resumes after step 8" in stdout
+    assert "resumes after step 4" in stdout
 
 
 def test_damaged_record_is_named(finetune, trained, tmp_path):
