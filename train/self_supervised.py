@@ -181,8 +181,7 @@ def _zoomed(view: PosedView, size: tuple[int, int], zoom: tuple[float, float], r
 
 
 def _seen(view: PosedView, K: FloatArray, size: tuple[int, int]) -> NDArray[np.uint8]:
-    depth = np.zeros(view.image.shape[:2], np.float32)
-    return warp(View(view.image, depth, view.K), K, np.eye(3), size).image
+    return warp(View.without_depth(view.image, view.K), K, np.eye(3), size).image
 
 
 def _affine(K: FloatArray, K_before: FloatArray) -> FloatArray:

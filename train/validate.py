@@ -84,8 +84,7 @@ def metres_by(network: DepthModule, metadata: Metadata) -> Callable[[PosedView],
     network.eval()
 
     def predict(view: PosedView) -> FloatArray:
-        unlabelled = View(view.image, np.zeros(view.image.shape[:2], np.float32), view.K)
-        return predict_metres(network, metadata, unlabelled)[0]
+        return predict_metres(network, metadata, View.without_depth(view.image, view.K))[0]
 
     return predict
 
@@ -166,7 +165,7 @@ def residuals_and_sigma(
     residuals, sigmas = [], []
     for view in views:
         depth, sigma = predict_metres(network, metadata, view)
-        v, u = np.nonzero((view.depth_m > MIN_DEPTH_M) & (view.depth_m < MAX_DEPTH_M))
+        v, u = np.nonzero(_counted(view))
         if not len(v):
             continue
         pick = rng.integers(len(v), size=min(PIXELS_PER_VIEW, len(v)))

@@ -271,5 +271,5 @@ def _pictures(data: Data, held_out: Sequence[View]) -> list[View]:
     views += [f.views[len(f.views) // 2] for f in data.labelled]
     for sequence in data.posed:
         v = sequence.views[len(sequence.views) // 2]
-        views.append(View(v.image, np.zeros(v.image.shape[:2], np.float32), v.K))
+        views.append(View.without_depth(v.image, v.K))
     return views[:4]

@@ -86,9 +86,13 @@ def log_metres(predict: Predict, sequence: PosedSequence) -> float:
 
 def at_points(depth: FloatArray, view: PosedView) -> FloatArray:
     """Values of a map ``(H, W)`` at the map points of a view, ``(N,)``."""
-    height, width = depth.shape
-    at = np.clip(np.rint(view.uv), 0, (width - 1, height - 1)).astype(int)
-    return depth[at[:, 1], at[:, 0]].astype(np.float64)
+    return depth[_nearest_pixels(view.uv, depth.shape)].astype(np.float64)
+
+
+def _nearest_pixels(uv: FloatArray, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of pixels ``(N, 2)``, those beyond the edge at the edge."""
+    at = np.clip(np.rint(uv), 0, (shape[1] - 1, shape[0] - 1)).astype(np.intp)
+    return at[:, 1], at[:, 0]
 
 
 def teach(predict: Predict, sequence: PosedSequence, log_scale: float, folder: Path) -> list[Taught]:
@@ -199,8 +203,7 @@ def _completed(predict: Predict, view: PosedView, measured: FloatArray, log_scal
     v, u = v[::SPACING], u[::SPACING]
     uv = np.concatenate([view.uv, np.stack([u, v], 1).astype(np.float32)])
     log_z = np.log(np.concatenate([view.z, measured[v, u]])) + log_scale
-    at = np.clip(np.rint(uv), 0, (width - 1, height - 1)).astype(int)
-    there = known[at[:, 1], at[:, 0]]
+    there = known[_nearest_pixels(uv, known.shape)]
     filled = np.where(known, predicted, np.median(predicted[known]))
     dense = np.where(known, np.exp(densify(np.log(filled), uv[there], log_z[there])), 0.0) if there.any() else filled
     return np.where(measured > 0, measured * metres, -dense).astype(np.float32)
@@ -208,7 +211,7 @@ def _completed(predict: Predict, view: PosedView, measured: FloatArray, log_scal
 
 def _small(view: PosedView) -> View:
     height, width = view.image.shape[:2]
-    whole = View(view.image, np.zeros((height, width), np.float32), view.K)
+    whole = View.without_depth(view.image, view.K)
     return fitted_view(whole, (round(height * WIDTH / width), WIDTH)) if width > WIDTH else whole
 
 
@@ -227,8 +230,7 @@ MAX_LOG_RATIO = 0.5
 def densify(log_depth: FloatArray, uv: FloatArray, log_z: FloatArray) -> FloatArray:
     """Log depth ``(H, W)`` corrected to pass near map points at pixels ``(N, 2)`` with log depths ``(N,)``."""
     height, width = log_depth.shape
-    v = np.clip(np.rint(uv[:, 1]), 0, height - 1).astype(int)
-    u = np.clip(np.rint(uv[:, 0]), 0, width - 1).astype(int)
+    v, u = _nearest_pixels(uv, log_depth.shape)
     ratio = log_z - log_depth[v, u]
     median = float(np.median(ratio))
     kept = np.abs(ratio - median) < MAX_LOG_RATIO

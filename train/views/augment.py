@@ -52,6 +52,11 @@ class View:
     K: FloatArray
     """``(3, 3)`` intrinsics [px]."""
 
+    @classmethod
+    def without_depth(cls, image: NDArray[np.uint8], K: FloatArray) -> "View":
+        """An image whose depth is not known anywhere."""
+        return cls(image, np.zeros(image.shape[:2], np.float32), K)
+
 
 def random_view(view: View, size: tuple[int, int], config: AugmentConfig, rng: np.random.Generator) -> View:
     """What a virtual camera of ``size = (height, width)`` at the same place sees: rotated, zoomed,

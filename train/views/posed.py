@@ -163,7 +163,7 @@ def _view(
     image = np.asarray(camera.undistort_image(image), np.uint8)
     if image.ndim == 2:
         image = np.repeat(image[..., None], 3, axis=2)
-    view = View(image, np.zeros(image.shape[:2], np.float32), camera.K)
+    view = View.without_depth(image, camera.K)
     if camera.width > width:
         view = fitted_view(view, (round(camera.height * width / camera.width), width))
     uv, z = visible_points(p_w, view.K, T_w_c, (view.image.shape[0], view.image.shape[1]))

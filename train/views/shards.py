@@ -154,7 +154,7 @@ def _samples_of(shard: Path) -> list[_Sample]:
     samples: list[_Sample] = []
     try:
         size = shard.stat().st_size
-        with open_plain(shard) as file, tarfile.open(fileobj=file, mode="r:") as tar:
+        with open_plain(shard) as opened, tarfile.open(fileobj=opened, mode="r:") as tar:
             for member in tar:
                 if not member.isfile():
                     continue
