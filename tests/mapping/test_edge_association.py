@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numeric import edges_along, pixels
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses.edge_alignment import EdgeAlignmentLoss
@@ -31,18 +32,9 @@ def make_edges(uv: FloatArray, normal: FloatArray) -> Edges:
 
 def see(T: FloatArray, p_w: FloatArray, direction: FloatArray) -> tuple[Edges, FloatArray]:
     """Edge pixels at whole pixels, normals to the left of the segments, and inverse depths."""
-    p, q = se3.transform(T, p_w), se3.transform(T, p_w + 1e-4 * direction)
-    uv = p[:, :2] / p[:, 2:] * K[:2] + np.array(K[2:])
-    along = q[:, :2] / q[:, 2:] * K[:2] + np.array(K[2:]) - uv
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    normal = np.stack((along[:, 1], -along[:, 0]), 1)
-    pixel, first = np.unique(np.rint(uv), axis=0, return_index=True)
-    inside = (pixel >= 0).all(1) & (pixel < np.array(SIZE)).all(1)
-    first = first[inside]
-    edges = Edges(
-        pixel[inside].astype(np.float32), normal[first].astype(np.float32), np.zeros((len(first), 3), np.uint8)
-    )
-    return edges, 1.0 / p[first, 2]
+    p, farther = se3.transform(T, p_w), se3.transform(T, p_w + 1e-4 * direction)
+    edges, which = edges_along(pixels(p, K), pixels(farther, K) - pixels(p, K), SIZE)
+    return edges, 1.0 / p[which, 2]
 
 
 def two_views(rng: np.random.Generator) -> tuple[FloatArray, list[EdgeField]]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from numeric import edges_along, pixels
 
 from edgeslam_torch.frontend.corners import Junctions
 from edgeslam_torch.geometry import se3
@@ -20,7 +21,7 @@ from edgeslam_torch.mapping.window_terms import (
 )
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, WindowProblem
-from edgeslam_torch.types import Edges, FloatArray
+from edgeslam_torch.types import FloatArray
 
 K = (500.0, 500.0, 319.5, 239.5)
 SIZE = (640, 480)
@@ -41,20 +42,10 @@ def see(T: FloatArray, world: FloatArray) -> Structure:
     s = np.linspace(0, 1, 80)[:, None]
     arms = (world[:, :1, None] * (1 - s) + world[:, 1:, None] * s).reshape(-1, 3)
     p = se3.transform(T, arms)
-    uv = p[:, :2] / p[:, 2:] * K[:2] + np.array(K[2:])
-    q = se3.transform(T, world.reshape(-1, 3))
-    ends = (q[:, :2] / q[:, 2:] * K[:2] + np.array(K[2:])).reshape(-1, 3, 2)
-    along = np.repeat((ends[:, 1:] - ends[:, :1]).reshape(-1, 2), 80, 0)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    normal = np.stack([along[:, 1], -along[:, 0]], 1)
-    pixel, first = np.unique(np.rint(uv), axis=0, return_index=True)
-    inside = (pixel >= 0).all(1) & (pixel < np.array(SIZE)).all(1)
-    first = first[inside]
-    edges = Edges(
-        pixel[inside].astype(np.float32), normal[first].astype(np.float32), np.zeros((len(first), 3), np.uint8)
-    )
-    inverse_depth = 1.0 / p[first, 2]
+    ends = pixels(se3.transform(T, world.reshape(-1, 3)), K).reshape(-1, 3, 2)
     arms_2d = ends[:, 1:] - ends[:, :1]
+    edges, which = edges_along(pixels(p, K), np.repeat(arms_2d.reshape(-1, 2), 80, 0), SIZE)
+    inverse_depth = 1.0 / p[which, 2]
     length = np.linalg.norm(arms_2d, axis=2)
     arms_2d = arms_2d / length[..., None]
     left = arms_2d[:, 0, 0] * arms_2d[:, 1, 1] - arms_2d[:, 0, 1] * arms_2d[:, 1, 0] < 0

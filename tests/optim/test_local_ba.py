@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numeric import pixels
 from seeded_window import (
     K,
     Noise,
@@ -92,8 +93,7 @@ def test_chi2_is_in_the_callers_order():
     problem = window.problem
     p_c = np.einsum("nij,nj->ni", result.T_c_w[problem.obs_pose][:, :3, :3], result.p_w[problem.obs_anchor])
     p_c += result.T_c_w[problem.obs_pose][:, :3, 3]
-    uv = p_c[:, :2] / p_c[:, 2:] * K[:2] + np.array(K[2:])
-    expected = np.square((uv - problem.uv) * problem.inv_sigma[:, None]).sum(1)
+    expected = np.square((pixels(p_c, K) - problem.uv) * problem.inv_sigma[:, None]).sum(1)
     np.testing.assert_allclose(result.chi2, expected, rtol=1e-9, atol=1e-20)
 
 
@@ -124,7 +124,7 @@ def test_an_anchor_practically_at_infinity_disturbs_nothing():
         p_w=np.concatenate((problem.p_w, far)),
         obs_pose=np.append(problem.obs_pose, 0),
         obs_anchor=np.append(problem.obs_anchor, len(problem.p_w)),
-        uv=np.concatenate((problem.uv, (ray[:2] / ray[2] * K[:2] + np.array(K[2:]))[None])),
+        uv=np.concatenate((problem.uv, pixels(ray[None], K))),
         inv_sigma=np.append(problem.inv_sigma, 1.0),
     )
     result = refine_window(with_far, TIGHT)
@@ -288,7 +288,7 @@ def test_a_search_ended_by_the_poses_is_at_the_minimum_within_the_tolerance(seed
 def world_from(T: np.ndarray, p_w: np.ndarray, fixed: int, rng: np.random.Generator) -> WindowProblem:
     pose, anchor = np.divmod(np.arange(len(T) * len(p_w)), len(p_w))
     p_c = np.einsum("nij,nj->ni", T[pose][:, :3, :3], p_w[anchor]) + T[pose][:, :3, 3]
-    uv = p_c[:, :2] / p_c[:, 2:] * K[:2] + np.array(K[2:]) + 0.5 * rng.normal(size=(len(pose), 2))
+    uv = pixels(p_c, K) + 0.5 * rng.normal(size=(len(pose), 2))
     return WindowProblem(
         T, np.arange(len(T)) < fixed, p_w + 0.05 * rng.normal(size=p_w.shape), pose, anchor, uv, np.ones(len(pose)), K
     )

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numeric import pixels
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.optim.pose_only import PoseConfig, PoseStatus, refine_pose
@@ -15,7 +16,7 @@ K = (520.0, 515.0, 320.0, 240.0)
 def view(rng: np.random.Generator, n: int = 300, noise_px: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     T = se3.exp(0.2 * rng.normal(size=6))
     p_c = rng.uniform((-1.5, -1, 2), (1.5, 1, 6), (n, 3))
-    uv = p_c[:, :2] / p_c[:, 2:] * K[:2] + np.array(K[2:]) + noise_px * rng.normal(size=(n, 2))
+    uv = pixels(p_c, K) + noise_px * rng.normal(size=(n, 2))
     return T, se3.transform(se3.inverse(T), p_c), uv
 
 
@@ -102,9 +103,7 @@ def test_few_points_have_a_status(n, rng):
 def test_degenerate_points_have_a_status(rng):
     T, p, _ = view(rng, 40)
     p = np.repeat(p[:1], 40, 0)  # one point forty times
-    p_c = se3.transform(T, p)
-    uv = p_c[:, :2] / p_c[:, 2:] * K[:2] + np.array(K[2:])
-    result = refine_pose(T, p, uv, np.ones(40), K)
+    result = refine_pose(T, p, pixels(se3.transform(T, p), K), np.ones(40), K)
     assert result.status is PoseStatus.DEGENERATE
     np.testing.assert_array_equal(result.T_c_w, T)
 
