@@ -90,33 +90,31 @@ def sources():
     return sorted({p for p in files if "__pycache__" not in p.parts})
 
 
-def statements(node):
-    """Statements inside a node at any depth, except for the type checker's own."""
-    for inner in ast.iter_child_nodes(node):
-        if isinstance(inner, ast.If) and getattr(inner.test, "id", "") == "TYPE_CHECKING":
-            continue
-        if isinstance(inner, ast.stmt):
-            yield inner
-        if isinstance(inner, ast.stmt | ast.ExceptHandler | ast.match_case):  # no import stands in an expression
-            yield from statements(inner)
+class Import(NamedTuple):
+    """What one statement imports."""
+
+    names: frozenset[str]
+    """Full names; of ``from package import module`` the module counts, not the package."""
+    is_for_types: bool
+    """Whether only the type checker follows it."""
 
 
-def imported(nodes, known=frozenset()):
-    """Full names that statements of a module import.
+def imports_in(node, known=frozenset(), is_for_types=False):
+    """Imports inside a parsed module or statement at any depth.
 
     Args:
-        nodes: `statements` of the parsed module, or with `ast.walk` also those for the type checker alone.
-        known: Modules; of ``from package import module`` the module counts, not the package.
+        known: Full names of modules.
     """
-    for node in nodes:
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "imports are by full name"
-            names = {f"{node.module}.{alias.name}" for alias in node.names}
-            yield from names & known
-            if names - known:
-                yield node.module or ""
+    if isinstance(node, ast.Import):
+        yield Import(frozenset(alias.name for alias in node.names), is_for_types)
+    elif isinstance(node, ast.ImportFrom):
+        assert node.level == 0, "imports are by full name"
+        names = {f"{node.module}.{alias.name}" for alias in node.names}
+        yield Import(frozenset(names & known | ({node.module or ""} if names - known else set())), is_for_types)
+    is_for_types |= isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
+    for part in ("body", "orelse", "finalbody", "handlers", "cases"):  # no import stands in an expression
+        for inner in getattr(node, part, ()):
+            yield from imports_in(inner, known, is_for_types)
 
 
 def forbidden(module, names):
@@ -138,15 +136,20 @@ MODULES = frozenset(module_name(path) for path in sources())
 
 
 @cache
-def imports():
-    """What each module of the package imports, by its full name."""
-    return {module_name(path): list(imported(statements(parsed(path)), MODULES)) for path in sources()}
+def all_imports():
+    """Imports of each module of the package, by its full name."""
+    return {
+        module_name(path): list(imports_in(ast.parse(path.read_text(encoding="utf-8")), MODULES)) for path in sources()
+    }
 
 
 @cache
-def parsed(path):
-    """Syntax tree of a file."""
-    return ast.parse(path.read_text(encoding="utf-8"))
+def imports():
+    """Names that each module of the package imports when it runs."""
+    return {
+        module: [name for each in found if not each.is_for_types for name in each.names]
+        for module, found in all_imports().items()
+    }
 
 
 def test_table_names_every_part_once_and_nothing_else():
@@ -167,7 +170,7 @@ def test_imports_are_those_of_the_table():
 
 
 def test_no_files_import_each_other_in_a_circle():
-    graph = {module_name(path): set(imported(ast.walk(parsed(path)), MODULES)) for path in sources()}
+    graph = {module: {name for each in found for name in each.names} for module, found in all_imports().items()}
     TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
