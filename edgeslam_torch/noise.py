@@ -79,8 +79,6 @@ UNKNOWN_MOUNT_RAD, UNKNOWN_LEVER_M, UNKNOWN_OFFSET_S = 0.1, 0.1, 0.02
 
 # --- clocks -----------------------------------------------------------------------------------------------------------
 
-STAMP_S = 0.05
-"""Of a message's stamp: half the message interval."""
 CLOCK_S = 0.005
 """Of an estimated video delay, beside its statistical error."""
 DELAY_S = 0.3
@@ -108,8 +106,6 @@ in the first seconds, later 1 to 2 %; with few features the scale may triple."""
 VISUAL_MEMORY_S = 0.5
 """Correlation time of the errors of visual poses: those of a real drone's flight grow with the root of time up to about
 a second, the time between keyframes, and hardly beyond."""
-VISUAL_SIGMA = 0.01
-"""Of a pose without a covariance [map units, rad]."""
 DEPTH_SCALE_LOG = 0.1
 """Scale error of the depth network common to all keyframes of a scene; the estimated part is added to it."""
 

@@ -300,8 +300,9 @@ def holed(case, name, hole, everywhere):
 @EVERY
 def test_finite_loss_has_finite_gradients_and_holes_leave_no_trace(case):
     numbers = [name for name, x in case.given().items() if x.is_floating_point()]
-    holes = (torch.nan, torch.inf, 0.0, 1e-30, 1e8, 1e20, 1e38)
-    for name, hole, everywhere in product(numbers, holes, (False, True)):
+    holes = [(hole, False) for hole in (torch.nan, torch.inf, 0.0, 1e-30, 1e20, 1e38)]
+    holes += [(hole, True) for hole in (torch.nan, torch.inf, 0.0, 1e20)]
+    for name, (hole, everywhere) in product(numbers, holes):
         value, slopes = holed(case, name, hole, everywhere)
         for b in range(B):
             for by, slope in slopes.items():
