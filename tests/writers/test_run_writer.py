@@ -24,6 +24,12 @@ def outputs(count):
     return slam, [slam.step(Frame(i, 100.0 + i / 30, image)) for i in range(count)]
 
 
+def finished(writer, slam, summary, support=None):
+    """What could not be written."""
+    support = support or slam.support()
+    return writer.finish(summary, *slam.trajectory(), support, slam.edge_map(), slam.anchors(), Units.METRES)
+
+
 def test_status_table_widens_for_a_stage_that_comes_later(tmp_path):
     writer = RunWriter(tmp_path)
     slam, frames = outputs(8)
@@ -44,19 +50,7 @@ def test_end_result(tmp_path):
     slam, frames = outputs(4)
     for output in frames:
         writer.append(output, 1.0)
-    stamps, poses = slam.trajectory()
-    assert (
-        writer.finish(
-            {"frames": 4, "sigma": math.inf},
-            stamps,
-            poses,
-            slam.support(),
-            slam.edge_map(),
-            slam.anchors(),
-            Units.METRES,
-        )
-        == []
-    )
+    assert finished(writer, slam, {"frames": 4, "sigma": math.inf}) == []
     writer.close()
     refined, online = np.loadtxt(tmp_path / "trajectory.txt"), np.loadtxt(tmp_path / "trajectory_online.txt")
     np.testing.assert_allclose(refined[:, 3] - online[:, 3], 1.0, atol=1e-8)
@@ -72,10 +66,10 @@ def test_pieces_that_were_never_joined_have_files_of_their_own(tmp_path):
     with closing(RunWriter(tmp_path)) as writer:
         for output in frames:
             writer.append(output, 1.0)
-        stamps, poses = slam.trajectory()
         support = Support(piece, supported)
         assert (support.largest(), support.others()) == (0, [1])
-        writer.finish({}, stamps, poses, support, slam.edge_map(), slam.anchors(), Units.METRES)
+        finished(writer, slam, {}, support)
+    stamps, poses = slam.trajectory()
     whole, other = (np.loadtxt(tmp_path / name) for name in ("trajectory.txt", "trajectory_piece_1.txt"))
     np.testing.assert_allclose(whole[:, 0], stamps[[0, 1, 2, 5, 6]], atol=1e-6)
     np.testing.assert_allclose(other[:, 0], stamps[3:5], atol=1e-6)
@@ -89,9 +83,7 @@ def leave_run(folder, frames=2):
     with closing(RunWriter(folder, config_toml="seed = 1\n")) as writer:
         for output in rows:
             writer.append(output, 1.0)
-        stamps, poses = slam.trajectory()
-        summary = {"version": "0.1.0", "frames": frames, "statuses": {}}
-        writer.finish(summary, stamps, poses, slam.support(), slam.edge_map(), slam.anchors(), Units.METRES)
+        finished(writer, slam, {"version": "0.1.0", "frames": frames, "statuses": {}})
 
 
 def contents(folder):
@@ -159,8 +151,7 @@ def test_full_disk_leaves_whole_lines_and_room_for_the_rest(tmp_path, monkeypatc
     assert "No space left" in writer.failure
     assert not writer.append(frames[4], 1.0)
     assert np.loadtxt(tmp_path / "trajectory_online.txt").shape == (3, 8)
-    stamps, poses = slam.trajectory()
-    assert writer.finish({}, stamps, poses, slam.support(), slam.edge_map(), slam.anchors(), Units.METRES) == []
+    assert finished(writer, slam, {}) == []
     assert np.loadtxt(tmp_path / "trajectory.txt").shape == (5, 8)
 
 
@@ -221,8 +212,6 @@ def test_result_that_cannot_be_written_is_named_and_the_others_are_written(tmp_p
         return replace(self, target)
 
     monkeypatch.setattr(Path, "replace", refuse)
-    stamps, poses = slam.trajectory()
-    missing = writer.finish({}, stamps, poses, slam.support(), slam.edge_map(), slam.anchors(), Units.METRES)
-    assert missing == ["edge_map.ply (No space left on device)"]
+    assert finished(writer, slam, {}) == ["edge_map.ply (No space left on device)"]
     assert "edge_map.ply" in writer.failure
     assert (tmp_path / "anchors.ply").exists()
