@@ -35,6 +35,10 @@ class PointMap:
         n = len(points)
         return FrameFeatures(uv, np.zeros(n, np.int32), np.zeros(n, np.float32), self.descriptors[points])
 
+    def depths(self, view):
+        """True depths of a keyframe's keypoints."""
+        return se3.transform(self.world.T_c_w[view], self.world.p_w)[self.point_of[view], 2]
+
     def fill(self, views=None):
         """Take keyframes into the map with one anchor for every point that two of them see; ids by point."""
         views = range(len(self.keyframes)) if views is None else views
@@ -82,6 +86,12 @@ def check_map(slam_map):
     for removed in slam_map.links:
         assert removed not in slam_map.keyframes
         assert np.isfinite(slam_map.pose_of(removed)).all()
+
+
+def pose_error(T_c_w, true):
+    """Lengths of the translation and of the rotation between two poses."""
+    xi = se3.log(T_c_w @ se3.inverse(true))
+    return np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])
 
 
 def small_motion(rng, translation, rotation):

@@ -28,12 +28,8 @@ def points(rng):
     return filled(rng, 300, 3)
 
 
-def true_depth(points, view):
-    return se3.transform(points.world.T_c_w[view], points.world.p_w)[points.point_of[view], 2]
-
-
 def test_network_depth_is_scaled_to_map_units(points):
-    keyframe, z = points.keyframes[0], true_depth(points, 0)
+    keyframe, z = points.keyframes[0], points.depths(0)
     depth = np.full((480, 640), np.nan, np.float32)
     u, v = np.rint(keyframe.features.uv).astype(int).T
     depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = z / 3.0  # the network's metre is three map units
@@ -44,7 +40,7 @@ def test_network_depth_is_scaled_to_map_units(points):
 
 
 def test_neighbouring_anchors_replace_a_missing_network(points):
-    keyframe, z = points.keyframes[0], true_depth(points, 0)
+    keyframe, z = points.keyframes[0], points.depths(0)
     prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors)
     assert (sigma == 0.35).all()
     assert prior.min() >= z.min() * 0.999
@@ -56,7 +52,7 @@ def test_neighbouring_anchors_replace_a_missing_network(points):
 @pytest.mark.parametrize(("twist", "sigma_log"), [(0.0, 0.051), (0.3, 0.061)])
 def test_a_wrong_network_is_corrected_by_anchors_with_a_larger_sigma(points, twist, sigma_log):
     """An error that grows across the image, as in an unfamiliar room, with a stated sigma of 1 %."""
-    keyframe, z = points.keyframes[0], true_depth(points, 0)
+    keyframe, z = points.keyframes[0], points.depths(0)
     u, v = np.rint(keyframe.features.uv).astype(int).T
     error = twist * (u - 320) / 320
     depth, sigma = np.full((480, 640), np.nan, np.float32), np.full((480, 640), 0.01, np.float32)
@@ -75,12 +71,12 @@ def relative_map(points, view, scale=0.7, shift=0.02):
     keyframe = points.keyframes[view]
     depth = np.full((480, 640), np.nan, np.float32)
     u, v = np.rint(keyframe.features.uv).astype(int).T
-    depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = scale / (1.0 / true_depth(points, view) - shift)
+    depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = scale / (1.0 / points.depths(view) - shift)
     return DepthMap(depth, np.full((480, 640), 0.25, np.float32), is_relative=True)
 
 
 def test_relative_depth_is_fitted_by_scale_and_shift(points):
-    keyframe, z = points.keyframes[0], true_depth(points, 0)
+    keyframe, z = points.keyframes[0], points.depths(0)
     keyframe.depth = relative_map(points, 0)
     prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors)
     known = np.isfinite(prior)

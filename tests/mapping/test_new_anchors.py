@@ -16,10 +16,6 @@ def points(rng):
     return PointMap(rng, 300, 3)
 
 
-def depth_of(points, view):
-    return se3.transform(points.world.T_c_w[view], points.world.p_w)[points.point_of[view], 2]
-
-
 def matched(points, prior_depth, sigma_log=0.35):
     a, b = points.keyframes[0], points.keyframes[1]
     sigma = np.full(len(prior_depth), sigma_log)
@@ -32,7 +28,7 @@ def triangulated(points, matches, min_parallax_deg=1.0):
 
 
 def test_matches_are_right_and_nearly_complete(points, rng):
-    prior = depth_of(points, 0) * np.exp(rng.normal(0, 0.2, len(points.point_of[0])))
+    prior = points.depths(0) * np.exp(rng.normal(0, 0.2, len(points.point_of[0])))
     matches = matched(points, prior)
     np.testing.assert_array_equal(points.point_of[0][matches.query], points.point_of[1][matches.train])
     common = len(np.intersect1d(points.point_of[0], points.point_of[1]))
@@ -41,13 +37,13 @@ def test_matches_are_right_and_nearly_complete(points, rng):
 
 
 def test_a_wrong_prior_gives_no_wrong_matches(points):
-    matches = matched(points, 20.0 * depth_of(points, 0), 0.1)
+    matches = matched(points, 20.0 * points.depths(0), 0.1)
     assert len(matches) < 0.05 * len(points.point_of[0])
 
 
 def test_keypoints_with_an_anchor_are_skipped(points):
     points.fill()
-    assert len(matched(points, depth_of(points, 0))) == 0
+    assert len(matched(points, points.depths(0))) == 0
 
 
 def test_unknown_prior_matches_nothing(points):
@@ -55,7 +51,7 @@ def test_unknown_prior_matches_nothing(points):
 
 
 def test_triangulated_points_are_exact(points):
-    matches = matched(points, depth_of(points, 0))
+    matches = matched(points, points.depths(0))
     p_w, sigma, used = triangulated(points, matches)
     truth = points.world.p_w[points.point_of[0][matches.query[used]]]
     np.testing.assert_allclose(p_w, truth, atol=2e-3)  # float32 pixels: 3e-5 px over little parallax
@@ -66,7 +62,7 @@ def test_triangulated_points_are_exact(points):
 
 def test_sigma_along_the_ray_matches_the_noise(rng):
     points = PointMap(rng, 2000, 3, noise_px=1.0)
-    matches = matched(points, depth_of(points, 0))
+    matches = matched(points, points.depths(0))
     p_w, sigma, used = triangulated(points, matches)
     truth = points.world.p_w[points.point_of[0][matches.query[used]]]
     ratio = np.linalg.norm(p_w - truth, axis=1) / sigma
@@ -84,7 +80,7 @@ def test_wrong_pairs_do_not_triangulate(points, rng):
 
 
 def test_too_little_parallax_is_rejected(points):
-    matches = matched(points, depth_of(points, 0))
+    matches = matched(points, points.depths(0))
     assert len(triangulated(points, matches, 60.0)[2]) == 0
 
 
@@ -94,7 +90,7 @@ def test_empty_input_gives_empty_output(points):
 
 
 def test_a_level_that_contradicts_the_distance_is_rejected(points):
-    matches = matched(points, depth_of(points, 0))
+    matches = matched(points, points.depths(0))
     points.keyframes[1].features.octave[:] = 6
     assert len(triangulated(points, matches)[2]) == 0
 
@@ -103,7 +99,7 @@ def test_a_similar_keypoint_off_the_epipolar_line_is_not_matched(points, rng):
     """Six pixels beside every keypoint sits one with the very descriptor; the right one differs in 20 bits."""
     a, b = points.keyframes[0], points.keyframes[1]
     T = b.T_c_w @ se3.inverse(a.T_c_w)
-    depth = depth_of(points, 0)
+    depth = points.depths(0)
     common, at_a, at_b = np.intersect1d(points.point_of[0], points.point_of[1], return_indices=True)
     p = CAMERA.back_project(a.features.uv[at_a], depth[at_a])
     along = CAMERA.project(se3.transform(T, 1.01 * p)) - CAMERA.project(se3.transform(T, p))
@@ -129,11 +125,11 @@ def test_a_similar_keypoint_off_the_epipolar_line_is_not_matched(points, rng):
 def test_a_point_must_reproject_in_the_sharper_of_two_views(points):
     """Six pixels across the line, half of them in each view: nothing at level 2, too much at level 0."""
     a, b = points.keyframes[0], points.keyframes[1]
-    matches = matched(points, depth_of(points, 0))
+    matches = matched(points, points.depths(0))
     b.features.octave[:] = 2
     assert len(triangulated(points, matches)[2]) > 0.6 * len(matches)
     T = b.T_c_w @ se3.inverse(a.T_c_w)
-    p = CAMERA.back_project(a.features.uv, depth_of(points, 0))
+    p = CAMERA.back_project(a.features.uv, points.depths(0))
     along = CAMERA.project(se3.transform(T, 1.01 * p)) - CAMERA.project(se3.transform(T, p))
     along = (along / np.linalg.norm(along, axis=1, keepdims=True))[matches.query]
     b.features.uv[matches.train] += (6.0 * np.stack([-along[:, 1], along[:, 0]], axis=1)).astype(np.float32)

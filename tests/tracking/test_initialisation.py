@@ -33,10 +33,6 @@ def points(rng):
     return PointMap(rng, 500, 6)
 
 
-def z_in(points, view):
-    return se3.transform(points.world.T_c_w[view], points.world.p_w)[points.point_of[view], 2]
-
-
 def view_of(points, view):
     return make_view(points.keyframes[view].features, SCALE_FACTOR)
 
@@ -76,7 +72,7 @@ def point_of_keypoint(points, structure):
 
 
 def test_two_exact_views_give_the_exact_world(points):
-    found = by_essential_matrix(points, z_in(points, 0))
+    found = by_essential_matrix(points, points.depths(0))
     np.testing.assert_allclose(found.p_w, points.world.p_w[points.point_of[0][found.reference_keypoint]], atol=5e-3)
     xi = se3.log(found.T_c_w @ se3.inverse(points.world.T_c_w[4]))
     assert np.abs(xi).max() < 1e-3
@@ -84,14 +80,14 @@ def test_two_exact_views_give_the_exact_world(points):
 
 def test_scale_comes_from_predicted_depths(points):
     """Twice the guessed depth: twice the baseline, about the first camera."""
-    one, two = (by_essential_matrix(points, k * z_in(points, 0)) for k in (1.0, 2.0))
+    one, two = (by_essential_matrix(points, k * points.depths(0)) for k in (1.0, 2.0))
     centre = points.keyframes[0].centre_w
     np.testing.assert_allclose(two.p_w - centre, 2.0 * (one.p_w - centre), rtol=1e-6)
 
 
 def turned_view(points, turn):
     """View 0 after a rotation of the camera on the spot, and its keypoints that lie ahead."""
-    ahead = np.flatnonzero(z_in(points, 0) > 1.0)
+    ahead = np.flatnonzero(points.depths(0) > 1.0)
     p_c = se3.transform(turn @ points.world.T_c_w[0], points.world.p_w[points.point_of[0][ahead]])
     view = view_of(points, 0)
     uv = view.features.uv.copy()
@@ -101,7 +97,7 @@ def turned_view(points, turn):
 
 def test_pure_rotation_is_rejected_with_a_reason(points):
     turn = se3.exp(np.array([0, 0, 0, 0.02, 0.1, 0.0]))
-    bootstrap = make_bootstrap(points, z_in(points, 0))
+    bootstrap = make_bootstrap(points, points.depths(0))
     view, _ = turned_view(points, turn)
     track = bootstrap.track(view, turn @ points.world.T_c_w[0])
     found = bootstrap.two_views(1, view, track, leaving=True)
@@ -111,20 +107,20 @@ def test_pure_rotation_is_rejected_with_a_reason(points):
 
 def test_few_matches_are_rejected_with_a_reason(points):
     few = np.arange(len(points.point_of[0])) < 40
-    bootstrap = make_bootstrap(points, z_in(points, 0))
+    bootstrap = make_bootstrap(points, points.depths(0))
     bootstrap.reference.features = replace(bootstrap.reference.features, corner=few)
     track = bootstrap.track(view_of(points, 4), points.world.T_c_w[4])
     found = bootstrap.two_views(4, view_of(points, 4), track, leaving=True)
     assert found.structure is None
     assert found.reason.endswith("corners matched")
     a, b = matches(points, 0, 4)
-    guess = guess_of(points, z_in(points, 0))
+    guess = guess_of(points, points.depths(0))
     nine = Structure(guess.T_c_w, a[:9], b[:9], guess.p_w[:9])
     assert from_essential_matrix(points.keyframes[0], nine, view_of(points, 4), CAMERA) is None
 
 
 def test_intermediate_frames_get_poses(points):
-    p = point_of_keypoint(points, by_essential_matrix(points, z_in(points, 0)))
+    p = point_of_keypoint(points, by_essential_matrix(points, points.depths(0)))
     rough = [small_motion(np.random.default_rng(v), 0.05, 0.02) @ points.world.T_c_w[v] for v in (1, 2, 3)]
     views = [witness(points, v, T) for v, T in zip((1, 2, 3), rough, strict=True)]
     for v, T in zip((1, 2, 3), poses_between(views, p, CAMERA), strict=True):
@@ -132,7 +128,7 @@ def test_intermediate_frames_get_poses(points):
 
 
 def test_an_intermediate_frame_with_few_matches_keeps_its_pose(points):
-    few = point_of_keypoint(points, by_essential_matrix(points, z_in(points, 0)))
+    few = point_of_keypoint(points, by_essential_matrix(points, points.depths(0)))
     few[np.flatnonzero(np.isfinite(few[:, 0]))[10:]] = np.nan
     rough = small_motion(np.random.default_rng(0), 0.05, 0.02) @ points.world.T_c_w[1]
     np.testing.assert_array_equal(poses_between([witness(points, 1, rough)], few, CAMERA)[0], rough)
@@ -164,7 +160,7 @@ def attempted(points, **config):
     """The bootstrap that saw views 0 to 4, those between waiting, and what it made of the last."""
     spread = np.random.default_rng(1).normal(0.0, 0.05, len(points.point_of[0]))
     config = InitialisationConfig(**config)
-    bootstrap = make_bootstrap(points, z_in(points, 0) * np.exp(spread), config)
+    bootstrap = make_bootstrap(points, points.depths(0) * np.exp(spread), config)
     check_map(points.map)
     assert points.map.anchors.from_depth[points.keyframes[0].anchor].all()
     accepted = None
@@ -184,7 +180,7 @@ def test_keypoints_on_edges_are_not_used_for_motion(points, side):
     view = view_of(points, 4)
     there = np.isin(points.point_of[4], points.point_of[0][corner])
     view.features.uv[~there] += 0.02 * (view.features.uv[~there][:, ::-1] - [CAMERA.cy, CAMERA.cx])
-    bootstrap = make_bootstrap(points, z_in(points, 0))
+    bootstrap = make_bootstrap(points, points.depths(0))
     if side == "reference":
         bootstrap.reference.features = replace(bootstrap.reference.features, corner=corner)
     else:
@@ -247,7 +243,7 @@ def test_intermediate_frames_become_keyframes_in_order(points):
 
 
 def test_distant_intermediate_frames_are_kept(points):
-    guess = z_in(points, 0)
+    guess = points.depths(0)
     bootstrap = make_bootstrap(points, guess, InitialisationConfig(keyframe_gap_s=0.01, max_keyframes=2))
     for index, view in enumerate((1, 1, 1, 2, 3), start=1):
         seen = view_of(points, view)
@@ -262,7 +258,7 @@ def test_distant_intermediate_frames_are_kept(points):
 
 def test_a_repeated_image_does_not_set_the_maximum_of_matches(points):
     """A camera that stands still matches every keypoint; by that, the first step away would look like another view."""
-    bootstrap = make_bootstrap(points, z_in(points, 0))
+    bootstrap = make_bootstrap(points, points.depths(0))
     still = bootstrap.track(view_of(points, 0), points.world.T_c_w[0])
     assert still.inliers > 0
     assert bootstrap.max_matched == 0
@@ -289,7 +285,7 @@ def seen_by(points, views, guess_depth=None, wrong_between=0.0, tracked=None, **
         wrong_between: Share of the matches in the views between that point anywhere.
         tracked: Pose of tracking in the last view in place of its own.
     """
-    guess_depth = z_in(points, 0) if guess_depth is None else guess_depth
+    guess_depth = points.depths(0) if guess_depth is None else guess_depth
     bootstrap = make_bootstrap(points, guess_depth, InitialisationConfig(**config))
     rng = np.random.default_rng(3)
     for view in views:
@@ -332,7 +328,7 @@ def test_a_map_with_many_outliers_is_rejected(points):
 
 
 def test_wrong_matches_of_the_second_view_are_no_points(points):
-    bootstrap = make_bootstrap(points, z_in(points, 0))
+    bootstrap = make_bootstrap(points, points.depths(0))
     view = view_of(points, 4)
     track = bootstrap.track(view, points.world.T_c_w[4])
     wrong = track.matched_keypoint[::9]
@@ -347,7 +343,7 @@ def test_wrong_matches_of_the_second_view_are_no_points(points):
 @pytest.mark.parametrize("leaving", [False, True])
 def test_two_views_alone_wait_for_a_third(points, leaving):
     """On repetitive texture many motions explain two views; the last view of the reference has no choice."""
-    bootstrap = make_bootstrap(points, z_in(points, 0))
+    bootstrap = make_bootstrap(points, points.depths(0))
     view = view_of(points, 4)
     track = bootstrap.track(view, points.world.T_c_w[4])
     assert (bootstrap.two_views(4, view, track, leaving).structure is not None) == leaving
@@ -364,7 +360,9 @@ def test_of_two_starts_the_more_probable_result_wins(points, monkeypatch, lost):
     with_network(points)
     true = points.world.T_c_w[4]
     if lost == "essential matrix":
-        away = guess_of(points, z_in(points, 0) * np.exp(np.random.default_rng(4).normal(0, 1.0, len(z_in(points, 0)))))
+        away = guess_of(
+            points, points.depths(0) * np.exp(np.random.default_rng(4).normal(0, 1.0, len(points.depths(0))))
+        )
         from_essential_matrix_comes(monkeypatch, replace(away, T_c_w=AWAY @ true))
     found = seen_by(points, (4,), tracked=AWAY @ true if lost == "tracking" else None).structure
     assert np.abs(se3.log(found.T_c_w @ se3.inverse(true))).max() < 0.01
@@ -381,7 +379,7 @@ def test_structure_keeps_the_networks_scale(points, monkeypatch, start):
     T[:3, 3] *= 1.5
     found = seen_by(points, (4,), tracked=T @ first).structure
     z = se3.transform(first, found.p_w)[:, 2]
-    assert np.median(z / z_in(points, 0)[found.reference_keypoint]) == pytest.approx(1.0, abs=0.02)
+    assert np.median(z / points.depths(0)[found.reference_keypoint]) == pytest.approx(1.0, abs=0.02)
     assert np.linalg.norm(se3.inverse(found.T_c_w)[:3, 3] - points.keyframes[0].centre_w) == pytest.approx(
         np.linalg.norm(points.keyframes[4].centre_w - points.keyframes[0].centre_w), rel=0.02
     )
@@ -393,7 +391,7 @@ def test_the_network_resolves_the_ambiguity_of_a_plane(seed, wrong, monkeypatch)
     """A plane's two views have two explanations that fit alike; only the shape of the guess tells them apart."""
     points = on_a_plane(PointMap(np.random.default_rng(seed), 400, 6))
     with_network(points)
-    right = guess_of(points, z_in(points, 0))
+    right = guess_of(points, points.depths(0))
     T, p_w = other_explanation(points, right)
     other = replace(right, T_c_w=T, p_w=p_w)
     true = points.world.T_c_w[4]
@@ -411,7 +409,7 @@ def test_the_shape_of_the_guess_does_not_bend_the_structure(points, network):
     """Every second depth is 30 % off: the images alone decide where they can."""
     if network:
         with_network(points)
-    z = z_in(points, 0)
+    z = points.depths(0)
     found = seen_by(points, (1, 2, 3, 4), guess_depth=z * np.where(np.arange(len(z)) % 2, 1.3, 1 / 1.3)).structure
     ratio = se3.transform(points.world.T_c_w[0], found.p_w)[:, 2] / z[found.reference_keypoint]
     assert np.median(np.abs(ratio / np.median(ratio) - 1.0)) < 0.01
@@ -465,7 +463,7 @@ def other_explanation(points, found):
 def test_an_adopted_predicted_map_keeps_its_matches(points):
     """Turned away before parallax came: the frames so far hang on the guess, each with its own matches."""
     with_network(points)
-    bootstrap = make_bootstrap(points, z_in(points, 0), InitialisationConfig(keyframe_gap_s=0.01))
+    bootstrap = make_bootstrap(points, points.depths(0), InitialisationConfig(keyframe_gap_s=0.01))
     for view in (1, 2, 3):
         seen = view_of(points, view)
         track = bootstrap.track(seen, points.world.T_c_w[view])

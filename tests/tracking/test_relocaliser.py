@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from point_map import CAMERA, SCALE_FACTOR, PointMap, filled
+from point_map import CAMERA, SCALE_FACTOR, PointMap, filled, pose_error
 
 from edgeslam_torch.config import OrbConfig, TrackingConfig
 from edgeslam_torch.frontend.matching import words
@@ -49,11 +49,6 @@ def view_of(points, view, rng, known=None):
 def poster(uv):
     """A picture on the wall."""
     return (np.abs(uv - [220, 240]) < [75, 60]).all(axis=1)
-
-
-def pose_error(T_c_w, truth):
-    xi = se3.log(T_c_w @ se3.inverse(truth))
-    return np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from point_map import CAMERA, SCALE_FACTOR, filled, small_motion
+from point_map import CAMERA, SCALE_FACTOR, filled, pose_error, small_motion
 
 from edgeslam_torch.config import OrbConfig, TrackingConfig
 from edgeslam_torch.geometry import se3
@@ -32,11 +32,6 @@ def view_of(points, view, rng, noise_px=0.0, wrong=0):
     return make_view(FrameFeatures(features.uv, features.octave, features.angle_rad, descriptors), SCALE_FACTOR)
 
 
-def pose_error(points, view, T_c_w):
-    xi = se3.log(T_c_w @ se3.inverse(points.world.T_c_w[view]))
-    return np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])
-
-
 def recent(points, view):
     keyframe = points.keyframes[view]
     return keyframe.anchor[keyframe.anchor >= 0]
@@ -45,7 +40,7 @@ def recent(points, view):
 def test_pose_of_a_noise_free_frame_is_exact(points, rng):
     predicted = small_motion(rng, 0.02, 0.01) @ points.world.T_c_w[3]
     track = tracker_of(points).track(view_of(points, 3, rng), predicted, recent(points, 2))
-    assert pose_error(points, 3, track.T_c_w)[0] < 1e-4
+    assert pose_error(track.T_c_w, points.world.T_c_w[3])[0] < 1e-4
     assert track.inliers == track.matches
     seen = np.flatnonzero(points.world.visible[3])
     np.testing.assert_array_equal(points.map.anchors.words[track.anchor], view_of(points, 3, rng).words[track.keypoint])
@@ -55,7 +50,7 @@ def test_pose_of_a_noise_free_frame_is_exact(points, rng):
 def test_half_a_pixel_of_noise_moves_the_pose_by_millimetres(points, rng):
     predicted = small_motion(rng, 0.02, 0.01) @ points.world.T_c_w[3]
     track = tracker_of(points).track(view_of(points, 3, rng, 0.5, 20), predicted, recent(points, 3))
-    translation, rotation = pose_error(points, 3, track.T_c_w)
+    translation, rotation = pose_error(track.T_c_w, points.world.T_c_w[3])
     assert translation < 0.01
     assert rotation < 0.004
     sigma = np.sqrt(np.diag(track.covariance))
@@ -176,8 +171,8 @@ def test_on_predicted_depths_the_motion_prior_constrains_the_pose(points, rng):
     held, free = (tracker.track(view, shift, recent(points, 3), e) for e in (expected, None))
     assert np.sqrt(np.diag(held.covariance))[:3].max() <= 5.01e-4
     assert np.sqrt(np.diag(free.covariance))[:3].max() > 1.5e-3
-    assert pose_error(points, 3, held.T_c_w)[0] < 2e-3
+    assert pose_error(held.T_c_w, points.world.T_c_w[3])[0] < 2e-3
     anchors.from_depth[ids] = False
     at_shift = TrackingPrior(PosePrior(0, shift, np.diag(sigma**-2)))
     sure = tracker.track(view, shift, recent(points, 3), at_shift)
-    assert pose_error(points, 3, sure.T_c_w)[0] < 0.01, "triangulated points need no such help"
+    assert pose_error(sure.T_c_w, points.world.T_c_w[3])[0] < 0.01, "triangulated points need no such help"
