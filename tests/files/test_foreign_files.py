@@ -9,6 +9,7 @@ from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.figures import read_record
+from edgeslam_torch.eval.inputs.run_folder import read_status
 from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
 from edgeslam_torch.eval.judge.table import read_thresholds
 from edgeslam_torch.eval.metrics.depth_error import read_depth
@@ -98,3 +99,12 @@ def test_what_is_no_file_is_refused_and_what_is_too_large_is_not_read(tmp_path, 
     with path.open("wb") as file:
         file.truncate(1 << 40)  # sparse: takes no room
     assert refusal(name, path)
+
+
+def test_a_runs_table_that_is_too_large_is_not_read(tmp_path):
+    """It may be missing, other than what `READERS` read."""
+    assert read_status(tmp_path / "status.csv") == ()
+    with (tmp_path / "status.csv").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(EvaluationError, match=r"status\.csv"):
+        read_status(tmp_path / "status.csv")
