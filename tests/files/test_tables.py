@@ -71,6 +71,8 @@ def test_errors_name_the_place(tmp_path, content, words):
 def test_an_incomplete_last_row_is_left_out_and_size_is_bounded(tmp_path):
     path = written(tmp_path, "1 2 3\n4 5 6\n7 8")
     assert len(read_table(path, SourceError).numbers()) == 2
+    with pytest.raises(SourceError, match="line 3 has 2 columns"):
+        read_table(written(tmp_path, "1 2 3\n4 5 6\n7 8\n"), SourceError).numbers()
     with pytest.raises(SourceError, match="MB"):
         read_table(path, SourceError, max_bytes=5)
 

@@ -47,6 +47,13 @@ def test_occluded_and_outside_edges_are_masked():
     assert CycleLoss.literal().residuals(T, uv, d, near, K).valid.tolist() == [True, True, False]
 
 
+def test_edges_without_depth_do_not_count_although_a_camera_that_moved_back_has_them_before_it():
+    T = lie.exp(torch.tensor([0.0, 0.0, 0.5, 0.0, 0.0, 0.0], dtype=torch.float64))
+    uv = torch.tensor([[300.0, 200.0], [310.0, 200.0]], dtype=torch.float64)
+    d_i, d_j = torch.tensor([[2.0, 0.0], [2.5, 0.5]], dtype=torch.float64)
+    assert CycleLoss().residuals(T, uv, d_i, d_j, K).valid.tolist() == [True, False]
+
+
 def test_pixels_go_the_way_of_the_equations():
     T, depth_i, depth_j = plane_world()
     uv = torch.tensor([[300.0, 200.0]], dtype=torch.float64)

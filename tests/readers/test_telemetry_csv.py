@@ -251,6 +251,23 @@ def test_clocks_that_begin_anew_and_dates_are_read(tmp_path, times, seconds):
 
 
 @pytest.mark.parametrize(
+    "times",
+    [
+        ["12:00:00.0", "09:00:00.1", "09:00:00.2", "09:00:00.3"],  # set back by three hours
+        ["100.0", "100.1", "1e15", "100.2"],  # one wild stamp
+    ],
+)
+def test_clocks_that_are_set_back_or_wild_do_not_begin_anew_and_cost_a_row(tmp_path, times):
+    table = read_table(write(tmp_path, "timestamp,yaw\n" + "".join(f"{t},1\n" for t in times)))
+    np.testing.assert_allclose(np.diff(table.stamps_s), 0.1, atol=0.005)
+    assert (len(table.stamps_s), table.skipped) == (3, 1)
+
+
+def test_of_two_columns_of_one_name_the_first_counts(tmp_path):
+    assert read_table(write(tmp_path, "timestamp,yaw,yaw\n0,1,5\n0.1,2,6\n")).values["yaw"].tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(
     "head",
     [
         b"ULog\x01\x125\x01",
