@@ -77,6 +77,12 @@ def test_connects_flies_streams_and_lands():
         assert emulator.drone.mode is Mode.FLYING
         tello.move(0.4, 0.0, 0.2)
         np.testing.assert_allclose(emulator.drone.p_w, [0.4, 0.0, 1.1], atol=0.12)
+        tello.turn(np.radians(30))
+        assert np.degrees(emulator.drone.yaw) == pytest.approx(30, abs=5)
+        tello.move(0.0, 0.4, 0.0)
+        np.testing.assert_allclose(emulator.drone.p_w, [0.2, 0.35, 1.1], atol=0.15)
+        with pytest.raises(TelloError, match="'go 5 0 0 40' was refused: out of range"):
+            tello.move(0.05, 0.0, 0.0)
         assert tello.query("battery?") == pytest.approx(100.0, abs=1.0)
         until(lambda: video.newest.count > first.count + 20)
         until(lambda: tello.latest.sample().tof_m > 0.8)

@@ -117,13 +117,13 @@ def changed(tmp_path, metadata=METADATA, **tensors):
 @pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
 def test_weights_without_depth_are_rejected_on_loading(tmp_path, backend):
     upstream = replace(METADATA, output="depth", uncertainty=False, sigma_floor=0.2)
-    for path in (
-        changed(tmp_path, decode_conv6__1__bias=1e5),
-        changed(tmp_path, upstream, decode_conv6__1__bias=-1.0),  # ReLU of a negative number
-        changed(tmp_path, decode_conv6__0__weight=0.0, decode_conv6__1__bias=1.0),  # the same for all images
+    for metadata, tensors, said in (
+        (METADATA, {"decode_conv6__1__bias": 1e5}, "no depth"),
+        (upstream, {"decode_conv6__1__bias": -1.0}, "no depth"),  # ReLU of a negative number
+        (METADATA, {"decode_conv6__0__weight": 0.0, "decode_conv6__1__bias": 1.0}, "the same depth"),
     ):
-        with pytest.raises(WeightsError, match=r"w\.safetensors"):
-            DepthPredictor(path, backend)
+        with pytest.raises(WeightsError, match=rf"w\.safetensors: gives {said}"):
+            DepthPredictor(changed(tmp_path, metadata, **tensors), backend)
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "torch"])

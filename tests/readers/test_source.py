@@ -1,5 +1,7 @@
 """Every kind of source, good and bad."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from edgeslam_torch.errors import CalibrationError, SourceError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.source import open_source
+from edgeslam_torch.types import TelemetrySample
 
 
 def test_tum_folder(tmp_path, write_tum):
@@ -177,8 +180,11 @@ def test_an_imu_beside_the_images_is_used_unless_the_user_says_otherwise(tmp_pat
     assert len(other.imu_readings) == 70
     given = [reading for _, readings in own.steps() for reading in readings]
     assert sum(map(len, given)) == 80
-    assert own.part(3, 1).imu_readings.stamps_s[0] >= 99.3
-    with pytest.raises(SourceError, match="gone"):
+    told = replace(own, telemetry=[TelemetrySample(s) for s in (98.0, 99.0, 99.4, 100.3)])
+    part = told.part(3, 1)  # from 100.3 s on
+    assert part.imu_readings.stamps_s[0] >= 99.3
+    assert [sample.stamp_s for sample in part.telemetry] == [99.4, 100.3]
+    with pytest.raises(SourceError, match=r"--imu .*gone\.csv: no such file"):
         open_source(folder, imu=tmp_path / "gone.csv")
 
 

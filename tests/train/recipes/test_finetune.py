@@ -296,7 +296,9 @@ def test_moved_data_and_folder_go_on(finetune, recordings, tmp_path):
 
 
 def test_damaged_record_is_named(finetune, trained, tmp_path):
-    for text in ("", "{}", "[1]", '{"given": {"weights": 1, "data": 5}}', "[" * 100_000):
+    inputs = '{"given": {"weights": 1, "data": 5}'
+    other_outcome = f'{inputs}, "sessions": [], "outcome": {{"steps": 4}}}}'
+    for text in ("", "{}", "[1]", inputs + "}", other_outcome, "[" * 100_000):
         (tmp_path / "out" / "finetune.json").write_text(text)
         refused(finetune("kitchen"), "finetune.json: unreadable")
 
