@@ -31,7 +31,8 @@ def filmed(rng, xis, true_sigma=0.3):
         id = slam_map.next_keyframe_id()
         keyframes.append(make_keyframe(id, id, float(id), T, features))
         slam_map.add_keyframe(keyframes[-1])
-    prior = prior_of(p[:, 2] * np.exp(rng.normal(0.0, true_sigma, COUNT)), np.full(COUNT, 0.5))
+    z = se3.transform(keyframes[0].T_c_w, p)[:, 2]
+    prior = prior_of(z * np.exp(rng.normal(0.0, true_sigma, COUNT)), np.full(COUNT, 0.5))
     colour = np.zeros((COUNT, 3), np.uint8)
     ids = add_on_prior(slam_map, CAMERA, keyframes[0], np.arange(COUNT), prior[:, 0], prior, colour)
     for keyframe in keyframes[1:]:
@@ -71,7 +72,9 @@ def test_a_true_translation_is_preserved(seed):
 
 def test_term_is_the_information_of_the_images_on_each_depth(rng):
     """By differences of projections: t' omega t, summed over motions, is I s^2 / (1 + I s^2)^2, summed over anchors."""
-    slam_map, keyframes, window = filmed(rng, [turn(0.0), turn(0.1, 0.03), [-0.02, 0.05, 0.04, 0.02, 0.0, 0.1]])
+    slam_map, keyframes, window = filmed(
+        rng, [[0.1, 0.0, 0.6, 0.0, 0.1, 0.0], turn(0.1, 0.03), [-0.02, 0.05, 0.04, 0.02, 0.0, 0.1]]
+    )
     problem, _ = window_problem(slam_map, window, CAMERA, LmConfig())
     host = keyframes[0]
     p_h = se3.transform(host.T_c_w, problem.p_w)

@@ -22,6 +22,11 @@ def test_way_clearance_and_each_change_of_state(tmp_path):
     assert page.count("<svg") == 2
 
 
+def test_a_long_flight_says_how_many_changes_are_left_out(tmp_path):
+    page = written(tmp_path, [f"{k},0,0,1,{('flying', 'turning')[k % 2]},,w\n" for k in range(70)])
+    assert page.count("<tr>") == 1 + 60 and "and 10 more" in page
+
+
 def test_exits_are_drawn_from_jamb_to_jamb(tmp_path):
     lines = [f"{k},{k}.0,0.0,1.0,flying,,w\n" for k in range(3)]
     without = written(tmp_path, lines)

@@ -107,6 +107,16 @@ def test_story_has_the_runs_own_figures(run, summary, told):
     assert all(text in story for text in told), story
 
 
+def test_events_are_the_stretches_that_were_not_plainly_tracked(run):
+    data = Page(write_report(run)).data
+    assert data["events"] == [
+        ["0.00 s", "0.05 s", "2", "initialised", "depth prior"],
+        ["4.50 s", "4.60 s", "3", "lost", "few matches (7) </script><b>"],
+        ["4.65 s", "4.65 s", "1", "relocalised", "keyframe 4"],
+    ]
+    assert data["matches"][:10] == [300, 304, 308, 313, 317, 321, 324, 328, 331, 333]
+
+
 def test_warnings_of_the_run_stand_under_its_story(run):
     said = ["telemetry's velocities are not used", "the video froze </script>"]
     file = write_report(with_summary(run, warnings=said))
