@@ -58,7 +58,7 @@ def see(T: FloatArray, world: FloatArray) -> Structure:
 @pytest.fixture
 def scene(rng: np.random.Generator) -> tuple[FloatArray, list[Structure]]:
     world = corners(rng)
-    T = np.stack([se3.exp(np.array([-0.15 * i, 0.02 * i, 0.1 * i, 0.0, 0.01 * i, 0.02 * i])) for i in range(4)])
+    T = np.stack([se3.exp(np.array([-0.15 * i, 0.02 * i, 0.3 * i, 0.0, 0.01 * i, 0.02 * i])) for i in range(4)])
     return T, [see(t, world) for t in T]
 
 
