@@ -15,20 +15,18 @@ from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.map_views import MapViews, Places
 from edgeslam_torch.navigation.openings.exit_tracker import PLACES_M, ExitTracker
 from edgeslam_torch.navigation.openings.wall_frame import Walls
-from edgeslam_torch.navigation.path_views import PathViews
 from edgeslam_torch.navigation.route import TIGHT_M, CostToGo, cost_to_go
-from edgeslam_torch.navigation.skills.skill import NO_WAY, Result, Skill
+from edgeslam_torch.navigation.skills.skill import NO_WAY, ROUND_S, Result, Skill
 from edgeslam_torch.navigation.space import CELL_M, Space
 from edgeslam_torch.navigation.speed_dither import dithered
 from edgeslam_torch.navigation.supervisor import DEAD_RECKONING_SIGMA_M
+from edgeslam_torch.navigation.views import ViewPlanner
 from edgeslam_torch.types import FloatArray
 
 BAND_M = 0.05
 """Required free height above and below the hull."""
 TAKE_OFF_M = 0.5
 """Radius around the take-off that the operator keeps clear."""
-_BESIDE_M = 0.6
-"""Distance within which cells beside an occupied goal count as goals: from afar, noise may occupy the goal's cell."""
 _REPLAN_S = 0.5
 _AHEAD_M = 0.8
 """Look-ahead distance along the path."""
@@ -36,18 +34,13 @@ _FACING_RAD = math.radians(30.0)
 """Heading error beyond which the drone turns first: it flies only where the camera looks."""
 _SIDEWAYS, _SLOW = 0.3, 0.6
 """Shares of the speed: outside the field of view, through space observed before; and beside unknown cells at hull
-distance."""
+distance, or back along the path."""
 _STANDS_M_S = 0.1
 """Speed below which unknown cells of the next metre are viewed first: from closer they are out of the picture."""
 _GAIN_M = 0.04
 """Minimum reduction of the cost to go by a movement [m]."""
 _MOVES_S = 1.0
 """Maximum wait for a view after a scale revision; views come at 5 Hz."""
-_LOST_S = 15.0
-"""Time without progress, a full look around, after which obstacles are reset and observed anew; the next time the
-skill has no way."""
-_NARROW_AHEAD_M = 2.0
-"""Distance ahead within which a too narrow gap is attributed to the last look."""
 _UPRIGHT_M, _UPRIGHT_SHARE = (0.7, 1.5), 0.7
 """Heights visible on a wall two metres away, and the occupied share that makes a column a wall."""
 
@@ -77,28 +70,19 @@ class Pilot:
     """Exits found so far, whatever the skill."""
     _plan: CostToGo | None = None
     _planned_s: float = -math.inf
-    _progress_s: float = math.nan
-    """Time of the last progress; time while overridden does not count."""
-    _updated_s: float = math.nan
-    """Time of the last state."""
-    _least: float = math.inf
-    """Lowest cost to go so far; NaN after a map correction."""
-    _progress: Places = field(default_factory=lambda: Places(MapViews(), np.zeros(2)))
+    _progress: Places = field(default_factory=Places)
     """Position at the last progress."""
+    _progress_s: float = -math.inf
+    _started_over: bool = False
+    """Whether it has started over there."""
     _revision: int = 0
     _revised_s: float = -math.inf
     """Last time at which the planner's scale was that of the states."""
     _at_take_off: bool = True
     """Whether the space around the take-off is not yet marked as free."""
-    _looks_first: bool = True
-    """Whether the first view from above is still to be taken."""
     _view: View | None = None
     """The last view, for the camera's field of view."""
-    _views: PathViews = field(init=False)
-    _tries_narrow: bool = True
-    """Whether too narrow gaps are still inspected; false after one without success."""
-    _doubted: Places = field(default_factory=Places)
-    """Position at which obstacles were reset last."""
+    _views: ViewPlanner = field(init=False)
     _losses: Losses = field(default_factory=Losses)
     """Tracking losses since the skill began."""
     _submap: int = 0
@@ -107,13 +91,12 @@ class Pilot:
     """Capture time of its first frame; minus infinity once older views have been dropped."""
 
     def __post_init__(self) -> None:
-        self._views = PathViews(self.limits.radius_m + BAND_M)
+        self._views = ViewPlanner(self.limits.radius_m + BAND_M, self.limits)
 
     def begin(self, skill: Skill) -> None:
         """Switch to another skill."""
         self.skill, self.result = skill, None
-        self._plan, self._planned_s, self._tries_narrow, self._doubted = None, -math.inf, True, Places()
-        self._progress_s, self._least, self._views.look = math.nan, math.inf, None
+        self._plan, self._progress, self._views.look = None, Places(), None
         self._losses = Losses()
 
     @property
@@ -150,11 +133,9 @@ class Pilot:
             return VelocityCommand(why="scale revised: waiting for a view")
         state = replace(state, views=self.views)
         self._take_in(state)
-        if state.overridden:  # that is no lack of progress
-            self._progress_s += state.stamp_s - self._updated_s
-        self._updated_s = state.stamp_s
         self._losses.note(state)
-        self.result = self.result or self.skill.result(state, self._losses.count)
+        if self.result is None and self._views.look is None:
+            self.result = self.skill.result(state, self._losses.count)
         return self._at_height(state, HOVER if self.result is not None else self._fly(state))
 
     def _take_in(self, state: DroneState) -> None:
@@ -162,13 +143,11 @@ class Pilot:
         if state.map_update is not None:
             self.space.correct(state.map_update)
             self.exits.expire()
-            self._plan, self._least = None, math.nan  # a correction is no progress
+            self._plan = None
         elif state.revision != self._revision:
             self._forget()
         self._revision, self._revised_s = state.revision, state.stamp_s
         self._check_submap(state)
-        if math.isnan(self._progress_s):
-            self._progress_s = self._updated_s = state.stamp_s
         if self._at_take_off:
             self._at_take_off = False
             for z in np.arange(0.1, self.limits.height_m + TAKE_OFF_M, 0.2):
@@ -180,9 +159,11 @@ class Pilot:
         self.space.flown(state.p_w, self.limits.radius_m + BAND_M)
         if self.exits.due(state):
             self.exits.look(self.walls(), state)
-            self.skill.consider(self.exits.candidates, self.exits.exits)
+            self._views.openings = self.exits.candidates
+            self.skill.consider(self.exits.exits)
         elif corrected:  # what it was given lies where the map was
-            self.skill.consider((), ())
+            self._views.openings = ()
+            self.skill.consider(())
 
     def _check_submap(self, state: DroneState) -> None:
         """Drop views of other submaps if their position relative to this one is too uncertain."""
@@ -190,14 +171,14 @@ class Pilot:
             self._submap, self._submap_s = state.submap, state.stamp_s - state.blind_s
         if state.submap_sigma_m > DEAD_RECKONING_SIGMA_M and self._submap_s > -math.inf:
             self.space.forget_before(self._submap_s)
-            self._plan, self._least, self._submap_s = None, math.nan, -math.inf
-            self._views.exhausted, self._doubted = Places(), Places()
+            self._views.start_over()
+            self._plan, self._submap_s = None, -math.inf
 
     def _forget(self) -> None:
         """Reset: the relation of the old scale to the new one is unknown."""
         self.space, self.exits = Space(map_views=self.views), ExitTracker()
-        self._plan, self._least, self._progress_s = None, math.inf, math.nan
-        self._at_take_off, self._looks_first, self._views.look = True, True, None
+        self._plan, self._progress = None, Places()
+        self._at_take_off, self._views = True, ViewPlanner(self._views.half_m, self.limits)
 
     def _turn(self, error_rad: float) -> float:
         return float(np.clip(2.0 * error_rad, -self.limits.turn_rad_s, self.limits.turn_rad_s))
@@ -209,57 +190,54 @@ class Pilot:
         """The command at the flight height or that of a look; off the flight height the drone does not move on."""
         # Dead reckoning by truncated velocities drifts in height; the drone measures its height.
         dead_reckoning = not state.tracked and math.isfinite(state.reported_height_m)
-        off_m = self.limits.height_m - (state.reported_height_m if dead_reckoning else float(state.p_w[2]))
-        rise_m = self._views.look.rise_m if self._views.look is not None else 0.0
-        moves = 1.0 if abs(off_m) < 2.0 * BAND_M else 0.0
-        up = self._climb(off_m + rise_m)
+        below_m = self.limits.height_m - (state.reported_height_m if dead_reckoning else float(state.p_w[2]))
+        up = self._climb(below_m + (self._views.look.rise_m if self._views.look is not None else 0.0))
+        moves = float(abs(below_m) < 2.0 * BAND_M)
         forward, left = moves * command.forward_m_s, moves * command.left_m_s
         return VelocityCommand(forward, left, up, command.turn_left_rad_s, command.why)
 
     def _fly(self, state: DroneState) -> VelocityCommand:
-        if (look := self._views.taking(state, self.limits.height_m)) is not None:
-            return VelocityCommand(turn_left_rad_s=self._turn(state.turn_to_rad(look.heading_rad)), why="look")
-        if (heading := self.skill.look_rad(state)) is not None:
+        here, stands = state.p_w[:2], float(np.linalg.norm(state.velocity_w[:2])) < _STANDS_M_S
+        looks = self._views.taking(state) is not None or self.skill.looks(state, self._views)
+        looks = looks or (stands and state.tracked and self._views.look_first(state))
+        if not self._progress.is_near(here, PLACES_M):
+            self._progress, self._progress_s, self._started_over = Places(state.views, here), state.stamp_s, False
+        if looks or state.overridden:
             self._progress_s = state.stamp_s
-            return VelocityCommand(turn_left_rad_s=self._turn(state.turn_to_rad(heading)), why="hover and look")
-        plan = self._planned(state)
-        here = state.p_w[:2]
-        stands = float(np.linalg.norm(state.velocity_w[:2])) < _STANDS_M_S
-        if self._looks_first and self.skill.moves and stands and state.tracked:
-            self._looks_first = False
-            forward = np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad)])
-            if len(self._unseen_w(state, here + np.outer(np.arange(CELL_M, 1.0, CELL_M), forward))):
-                self._views.look_ahead(state)
-                return HOVER
-        now = float(plan.at(here))
-        if math.isnan(self._least):
-            self._least = now
-        if now < self._least - 0.1 or not self._progress.is_near(here, PLACES_M):
-            self._least, self._progress_s = min(now, self._least), state.stamp_s
-            self._progress = Places(state.views, here)
-        elif state.stamp_s - self._progress_s > _LOST_S:
+        if looks:
+            look = self._views.look
+            turn = 0.0 if look is None else self._turn(state.turn_to_rad(look.heading_rad))
+            return VelocityCommand(turn_left_rad_s=turn, why="look")
+        if state.stamp_s - self._progress_s > ROUND_S:
             self._start_over(state)
             return HOVER
-        if not math.isfinite(now):
+        plan = self._planned(state)
+        if not math.isfinite(plan.at(here)):
             return VelocityCommand(turn_left_rad_s=0.5 * self.limits.turn_rad_s, why="no path: look around")
         self.way_w = plan.way(here, 3.0)
         ahead, faced = self._bearing(here), self.skill.faces_rad(state)
         error = state.turn_to_rad(ahead if faced is None else faced)
         turn = self._turn(error)
         chosen = self._chosen(state, plan, ahead, error)
-        if (chosen is None or stands) and abs(error) < _FACING_RAD and state.tracked:
-            if self._views.begin(
-                self._unseen_w(state, self.way_w[: round(1.0 / CELL_M)]), ahead, self._view, state, self.limits
-            ):
+        if (stands or chosen is None) and abs(error) < _FACING_RAD and state.tracked:
+            unseen_w = self._unseen_w(state, self.way_w[: round(1.0 / CELL_M)])
+            if self._views.look_along(unseen_w, ahead, self._view, state):
                 chosen = None
-            elif chosen is None:
-                self._tries_narrow &= not self._is_narrow(state)
         if chosen is None:
             return VelocityCommand(turn_left_rad_s=turn, why="wait for a view of the path")
         c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
         return VelocityCommand(
             c * chosen[0] + s * chosen[1], c * chosen[1] - s * chosen[0], 0.0, turn, "along the path"
         )
+
+    def _start_over(self, state: DroneState) -> None:
+        """Observe obstacles anew, once per place: they may stem from a wrong depth or pose."""
+        if self._started_over or not state.tracked:
+            self.result = NO_WAY
+            return
+        self.space.doubt_solids()
+        self._views.start_over()
+        self._plan, self._progress_s, self._started_over = None, state.stamp_s, True
 
     def _unseen_w(self, state: DroneState, way_w: FloatArray) -> FloatArray:
         """Unknown cells ``(U, 2)`` that block a path ``(W, 2)``."""
@@ -272,21 +250,13 @@ class Pilot:
         away = np.linalg.norm(p_w[:, None] - way_w, axis=-1).min(axis=1, initial=math.inf)
         return np.asarray(p_w[away < need])
 
-    def _is_narrow(self, state: DroneState) -> bool:
-        """Whether the path just ahead is too narrow to fly through."""
-        assert self.layer is not None
-        ahead = self.way_w[: round(_NARROW_AHEAD_M / CELL_M)]
-        need = self.limits.clearance_m(state.position_sigma_m) - 0.5 * CELL_M
-        return bool((self.layer.from_solid_at(ahead) <= need).any())
-
     def _planned(self, state: DroneState) -> CostToGo:
         """The plan, updated every `_REPLAN_S`."""
         self.layer = self.space.layer(self.limits.height_m, self.limits.radius_m + BAND_M)
         if self._plan is None or state.stamp_s - self._planned_s >= _REPLAN_S:
-            goals = self.skill.goals(self.layer, state)
+            goals = self.skill.goals(self.layer, state, self._views)
             need, here = self.limits.clearance_m(state.position_sigma_m), self.layer.cells(state.p_w[:2])
-            narrow = self._hull_m(state) if self._tries_narrow else math.inf
-            self._plan = cost_to_go(self.layer, goals, need, here, _BESIDE_M, narrow)
+            self._plan = cost_to_go(self.layer, goals, need, self._hull_m(state), here)
             self._planned_s = state.stamp_s
         return self._plan
 
@@ -314,10 +284,6 @@ class Pilot:
             return None
         return arcs.velocity_w[best]
 
-    def _may_squeeze(self, here: FloatArray) -> bool:
-        """Whether a look from here did not open the path, and unknown cells are not obstacles that were reset."""
-        return self._views.exhausted.is_near(here, PLACES_M) and not self._doubted.is_near(here, PLACES_M)
-
     def _passes_slowly(self, arcs: Arcs, state: DroneState) -> np.ndarray:
         """``(C,)`` slow moves with full clearance to obstacles but only hull distance to unknown cells, where no look
         shows more of them, and moves with hull distance to both along the path flown.
@@ -328,7 +294,8 @@ class Pilot:
         slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SLOW * self.limits.speed_m_s + 1e-6
         hull_m = self._hull_m(state)
         beside = arcs.from_solid_m >= self.limits.clearance_m(state.position_sigma_m)
-        beside &= self._may_squeeze(state.p_w[:2])
+        # After a start over, unknown cells may be obstacles that were reset.
+        beside &= self._views.exhausted.is_near(state.p_w[:2], PLACES_M) and not self._started_over
         back = (arcs.from_solid_m >= hull_m + 0.5 * CELL_M) & self.space.was_at(arcs.p_w).all(axis=1)
         return np.asarray(slow & (arcs.clearance_m >= hull_m) & (beside | back))
 
@@ -338,22 +305,9 @@ class Pilot:
 
     def _score(self, arcs: Arcs, plan: CostToGo, state: DroneState, error: float) -> FloatArray:
         """Cost to go after each candidate plus a penalty for low clearance; infinite for fast ones outside the view."""
-        away = arcs.from_solid_m if self._may_squeeze(state.p_w[:2]) else arcs.clearance_m
+        away = arcs.from_solid_m if self._views.exhausted.is_near(state.p_w[:2], PLACES_M) else arcs.clearance_m
         score = np.asarray(plan.at(arcs.end_w)) + 0.5 * np.clip(TIGHT_M - away, 0.0, None)
         fast = np.linalg.norm(arcs.velocity_w, axis=1) > _SIDEWAYS * self.limits.speed_m_s + 1e-6
         off = np.abs(wrapped(np.arctan2(arcs.velocity_w[:, 1], arcs.velocity_w[:, 0]) - state.yaw_rad))
         score[fast & ((off > _FACING_RAD) | (abs(error) > _FACING_RAD))] = np.inf
         return score
-
-    def _start_over(self, state: DroneState) -> None:
-        """Reset the obstacles and look anew, once per place: they may stem from a wrong depth or an old pose.
-
-        Reset cells are freed by two views instead of up to ten, so they are not passed at hull distance.
-        """
-        if self._doubted.is_near(state.p_w[:2], PLACES_M) or not state.tracked:
-            self.result = NO_WAY
-            return
-        self.space.doubt_solids()
-        self._plan, self._least, self._progress_s = None, math.inf, state.stamp_s
-        self._doubted, self._tries_narrow = Places(state.views, state.p_w[:2]), True
-        self._views = PathViews(self._views.half_m)

@@ -1,6 +1,5 @@
 """Global planner: cost to go over a layer, optimistic about unknown cells."""
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -8,7 +7,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from edgeslam_torch.navigation.layer import Layer, distance_cells
+from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.types import FloatArray
 
 _NEIGHBOURS = ((1, 0), (0, 1), (1, 1), (1, -1))
@@ -52,61 +51,38 @@ class CostToGo:
         return np.array(out)
 
 
-def cost_to_go(
-    layer: Layer,
-    goals: np.ndarray,
-    clearance_m: float,
-    here: np.ndarray,
-    beside_m: float = 0.0,
-    narrow_m: float = math.inf,
-) -> CostToGo:
+def cost_to_go(layer: Layer, goals: np.ndarray, clearance_m: float, hull_m: float, here: np.ndarray) -> CostToGo:
     """Cost to go from every cell to the goals (Dijkstra from the goals).
 
     Args:
         layer: Free, occupied and unknown cells.
-        goals: Cells ``(G, 2)``; blocked ones are ignored.
+        goals: Cells ``(G, 2)``; those inside of obstacles are ignored.
         clearance_m: Required distance of the drone's centre from obstacles.
+        hull_m: Distance down to which paths are planned at high cost, though they may not be flown.
         here: The drone's cell ``(2,)``; the path may start closer to an obstacle.
-        beside_m: If no goal is reachable, the nearest reachable cells within this distance of one are goals too.
-        narrow_m: Distance from obstacles down to which paths are planned at high cost, though they may not be flown.
     """
-    away, slack = layer.from_solid_m, 0.5 * layer.cell_m
-    open_ = away > min(clearance_m, narrow_m) - slack
+    away_m, slack_m = layer.from_solid_m, 0.5 * layer.cell_m
+    open_ = away_m > hull_m - slack_m
     low = np.maximum(here - 2, 0)
     open_[low[0] : here[0] + 3, low[1] : here[1] + 3] |= ~layer.solid[low[0] : here[0] + 3, low[1] : here[1] + 3]
-    tight = np.clip(1.0 - (away - clearance_m) / TIGHT_M, 0.0, 1.0)
+    tight = np.clip(1.0 - (away_m - clearance_m) / TIGHT_M, 0.0, 1.0)
     weight = np.where(layer.free, 1.0, _UNSEEN_COST) + _TIGHT_COST * tight
-    weight += np.where(away > clearance_m - slack, 0.0, _NARROW_COST)
-    shape = layer.free.shape
-    first, second, length = _edges(shape)
-    flat, w = open_.ravel(), weight.ravel()
-    kept = flat[first] & flat[second]
+    weight = np.where(away_m > clearance_m - slack_m, weight, weight + _NARROW_COST).ravel()
+    first, second, length = _edges(layer.free.shape)
+    kept = open_.ravel()[first] & open_.ravel()[second]
     a, b = first[kept], second[kept]
     graph = csr_array(
-        (length[kept] * layer.cell_m * 0.5 * (w[a] + w[b]), (a.astype(np.int32), b.astype(np.int32))),
-        shape=(flat.size, flat.size),
+        (length[kept] * layer.cell_m * 0.5 * (weight[a] + weight[b]), (a.astype(np.int32), b.astype(np.int32))),
+        shape=(open_.size, open_.size),
     )
-    at_goals = np.zeros(shape, bool)
+    at_goals = np.zeros(open_.shape, bool)
     at_goals[tuple(np.asarray(goals, dtype=int).T)] = True
-    cost = _from(graph, at_goals & open_)
-    if np.isfinite(cost[tuple(here)]) or beside_m == 0.0 or not at_goals.any():
-        return CostToGo(layer, cost)
-    away = distance_cells(~at_goals)
-    for cells in range(1, round(beside_m / layer.cell_m) + 1):
-        cost = _from(graph, open_ & (away <= cells))
-        if np.isfinite(cost[tuple(here)]):
-            break
-    return CostToGo(layer, cost)
-
-
-def _from(graph: csr_array, sources: np.ndarray) -> FloatArray:
-    """Cost of every cell from the nearest source ``(X, Y)`` bool; infinite without sources."""
-    index = np.flatnonzero(sources)
-    if len(index) == 0:
-        return np.full(sources.shape, np.inf)
+    sources = np.flatnonzero(at_goals & open_)
+    if len(sources) == 0:
+        return CostToGo(layer, np.full(open_.shape, np.inf))
     # SciPy 1.13 requires 32-bit indices; a grid has 25 600 cells.
-    found = dijkstra(graph, directed=False, indices=index.astype(np.int32), min_only=True)
-    return np.asarray(found).reshape(sources.shape)
+    cost = dijkstra(graph, directed=False, indices=sources.astype(np.int32), min_only=True)
+    return CostToGo(layer, np.asarray(cost).reshape(open_.shape))
 
 
 @lru_cache(maxsize=4)

@@ -71,7 +71,7 @@ class Space:
     """``(2,)`` int, world cell at the grid's corner."""
     _views: deque[View] = field(init=False)
     _doubted_s: float = field(init=False)
-    """Capture time of the newest view that only frees cells (`doubt_solids`)."""
+    """Capture time of the newest view whose obstacles were reset (`doubt_solids`)."""
     _flown: Places = field(init=False)
     _flown_m: list[float] = field(init=False)
     """Radius around each of these points [m]."""
@@ -141,12 +141,16 @@ class Space:
         self._build()
 
     def forget_before(self, seen_s: float) -> None:
-        """Drop everything but the views since a time."""
+        """Drop everything but the views since a time, and contacts: no view shows what was felt."""
         kept = [view for view in self._views if view.stamp_s >= seen_s]
         self._views = deque(kept, maxlen=MAX_VIEWS)
         self._flown, self._flown_m = Places(size=3), []
-        self._contacts = Places(size=3)
         self._build()
+
+    def doubt_solids(self) -> None:
+        """Reset occupied cells to unknown until they are observed again; free cells and contacts stay."""
+        self._odds[self._odds > 0.0] = 0.0
+        self._doubted_s = max((view.stamp_s for view in self._views), default=-np.inf)
 
     def _build(self) -> None:
         self._odds[:], self._way[:] = 0.0, 0
@@ -154,11 +158,6 @@ class Space:
             self._add(view, fills=view.stamp_s > self._doubted_s)
         for p_w, radius_m in zip(self._flown.p_w, self._flown_m, strict=True):
             self._pass(p_w, radius_m)
-
-    def doubt_solids(self) -> None:
-        """Reset occupied cells to unknown until they are observed again; free cells and contacts stay."""
-        self._odds[self._odds > 0.0] = 0.0
-        self._doubted_s = self._views[-1].stamp_s if self._views else -np.inf
 
     def layer(self, height_m: float, half_m: float) -> Layer:
         """Slice for flight at a height; a cell is free if all cells within ``half_m`` above and below are."""

@@ -86,7 +86,7 @@ def test_entries_come_back_to_the_last_bit(tmp_path):
     log.close()
     first, goto, explore, home, follow, back, decision = read_plan(tmp_path / PLAN)
     assert first == limits and decision == entries[-1] and explore.skill.until_s == math.inf
-    assert follow.skill.until_s == 7.5 and not follow.skill.wall
+    assert follow.skill.until_s == 7.5
     assert goto.skill.goal_w.tolist() == [1.0, -2.0, 1.15] and home.skill.track_w.shape == (0, 2)
     assert (back.p_w == seen.p_w).all() and math.isnan(back.seen_s) and back.revision == 2 and back.metric is False
     assert back.view.depth_m.dtype == np.float32 and (back.view.depth_m == seen.view.depth_m).all()

@@ -8,7 +8,6 @@ import pytest
 from views import longer, moved
 
 from edgeslam_torch.navigation.drone_state import DroneState, View
-from edgeslam_torch.navigation.exploring.frontiers import Looks, reachable
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import MapUpdate, MapViews
 from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
@@ -382,24 +381,6 @@ def test_without_walls_there_is_no_direction():
     assert wall_directions(surroundings(lambda a, b: np.zeros(a.shape, bool)), HERE) == []
 
 
-def test_what_is_looked_at_in_vain_is_left():
-    looks, layer = Looks(), surroundings(lambda a, b: np.zeros(a.shape, bool)).layer
-    near, far = layer.cells(np.array([[0.5, 0.0]])), layer.cells(np.array([[4.0, 0.0]]))
-    both = np.concatenate([near, far])
-    for k in range(12):
-        kept = looks.worth(both, layer, state(0.0, stamp_s=0.5 * k))
-    assert kept.tolist() == far.tolist()
-    assert not looks.over(100.0)
-    looks.worth(near, layer, state(0.0, stamp_s=6.0))
-    assert not looks.over(18.0) and looks.over(20.0)
-
-
-def test_what_a_wall_parts_is_not_reachable():
-    layer = surroundings(lambda a, b: np.abs(a - 2.0) < 0.1).layer
-    cells = layer.cells(np.array([[1.0, 0.0], [4.0, 0.0]]))
-    assert reachable(cells, layer, HERE).tolist() == cells[:1].tolist()
-
-
 def test_upright_is_what_fills_the_height():
     space = Space()
     for z in np.arange(0.05, 2.3, 0.1):
@@ -478,15 +459,12 @@ def test_the_pilot_takes_what_is_low_for_no_wall():
     assert walls.upright[first] and not walls.upright[second]
 
 
-def test_the_pilot_passes_candidates_to_its_skill(monkeypatch):
+def test_the_pilot_looks_at_undecided_openings(monkeypatch):
     monkeypatch.setattr(Pilot, "walls", lambda self: surroundings(wall(0.9)))
-    task = Explore()
-    pilot = Pilot(task)
+    pilot = Pilot(Explore())
     pilot.exits = watched([0.0] * 8, surroundings(wall(0.9)))
     pilot.update(state(0.0, stamp_s=9.0, view=VIEW))
-    assert pilot.exits.candidates
-    assert task.look_rad(state(1.0, stamp_s=9.1)) is not None, "it looks around first"
-    assert len(task.goals(surroundings(wall(0.9)).layer, state(-1.0, stamp_s=9.2)))
+    assert pilot.exits.candidates and pilot._views.openings == pilot.exits.candidates
 
 
 def test_the_pilot_passes_exits_to_its_skill(monkeypatch):
@@ -494,7 +472,7 @@ def test_the_pilot_passes_exits_to_its_skill(monkeypatch):
     told = []
 
     class Listens(GoTo):
-        def consider(self, candidates, exits=()):
+        def consider(self, exits):
             told.extend(exits)
 
     pilot = Pilot(Listens(np.array([3.0, 0.0, 1.15])))

@@ -1,48 +1,43 @@
 """Skills: explore, and find exits."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from edgeslam_torch.navigation.drone_state import DroneState
-from edgeslam_torch.navigation.exploring.frontiers import WIDE_M, Looks, frontiers, reachable
-from edgeslam_torch.navigation.exploring.view_planner import ViewPlanner
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
-from edgeslam_torch.navigation.skills.skill import Result, Skill
+from edgeslam_torch.navigation.openings.exit_tracker import Exit
+from edgeslam_torch.navigation.skills.skill import ROUND_S, Result, Skill
+from edgeslam_torch.navigation.views import ViewPlanner
 
 
 @dataclass(slots=True)
 class Explore(Skill):
-    """Frontier exploration by the view planner, until no frontier is left."""
+    """Fly from viewpoint to viewpoint of the view planner, until none is left."""
 
-    _looks: Looks = field(default_factory=Looks)
-    _views: ViewPlanner = field(default_factory=ViewPlanner)
+    _nothing_s: float = math.nan
+    """Since when there is none."""
 
-    def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """Viewpoints of undecided openings near the path; else these and wide frontiers and viewpoints of uncovered
-        borders; else narrow frontiers. Exploration is not over while there are any."""
-        borders = self._looks.worth(reachable(frontiers(layer), layer, state.p_w[:2]), layer, state)
-        wide = (borders[:, None] == frontiers(layer, WIDE_M)).all(-1).any(1)
-        found = self._views.goals(layer, state, borders[wide])
+    def goals(self, layer: Layer, state: DroneState, views: ViewPlanner) -> np.ndarray:
+        """Viewpoints of borders of the free space, and of undecided openings."""
+        found = views.viewpoints(layer, state)
         if len(found):
-            self._looks.go_on()
-        return found if len(found) else borders
+            self._nothing_s = math.nan
+        elif math.isnan(self._nothing_s):
+            self._nothing_s = state.stamp_s
+        return found
 
     def result(self, state: DroneState, losses: int = 0) -> Result | None:
         """Reached when nothing is left to explore; tracking losses do not end it, since other places remain."""
-        if self._looks.over(state.stamp_s):
+        if state.stamp_s - self._nothing_s > ROUND_S:
             return Result(True, "nothing is left to explore")
         return super(Explore, self).result(state)
 
-    def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
-        """Receive undecided openings."""
-        self._views.consider(candidates)
-
-    def look_rad(self, state: DroneState) -> float | None:
-        """Heading to an undecided opening or an uncovered border visible from here."""
-        return self._views.heading_rad(state)
+    def looks(self, state: DroneState, views: ViewPlanner) -> bool:
+        """Where a view shows something."""
+        return views.look_around(state)
 
 
 @dataclass(slots=True)
@@ -51,9 +46,8 @@ class FindExits(Explore):
 
     _found: bool = False
 
-    def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
-        """Receive undecided openings and exits."""
-        super(FindExits, self).consider(candidates)
+    def consider(self, exits: Sequence[Exit]) -> None:
+        """Receive exits."""
         self._found = bool(exits)
 
     def result(self, state: DroneState, losses: int = 0) -> Result | None:

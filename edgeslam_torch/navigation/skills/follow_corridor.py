@@ -6,35 +6,35 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from edgeslam_torch.navigation.corridor.corridor_geometry import (
-    SMEARED_BERTH_M,
-    far_middle,
-    is_ahead,
-    is_walled,
-    straight,
-    wide,
-)
-from edgeslam_torch.navigation.corridor.trail import PASSED_M, Trail, aside
 from edgeslam_torch.navigation.drone_state import DroneState
-from edgeslam_torch.navigation.exploring.frontiers import Looks
-from edgeslam_torch.navigation.exploring.view_planner import ViewPlanner
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_views import Places
-from edgeslam_torch.navigation.openings.exit_tracker import SAME_COS, Candidate, Exit
+from edgeslam_torch.navigation.openings.exit_tracker import SAME_COS, Exit
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
+from edgeslam_torch.navigation.openings.wall_frame import Walls, wall_directions
 from edgeslam_torch.navigation.skills.skill import FEW_LOSSES, Result, Skill
+from edgeslam_torch.navigation.views import ViewPlanner
 from edgeslam_torch.types import FloatArray
 
+_BERTH_M, _NARROW_M = 0.55, 0.3
+"""Clearance of the space that is followed: a corridor is wider than twice this, a doorway is not; and straight ahead,
+where underestimated depth may narrow the corridor to a door's width."""
+_ARRIVED_M = 0.6
+"""Minimum free distance ahead."""
+_SAME_CORRIDOR_M = 0.5 * WIDEST_M
+"""Points within this distance of the path flown are in the same corridor."""
+_STEP_M = 1.0
+"""Distance over which the direction of flight is measured, and to the free space that is followed."""
+_ALONG_WALLS_COS = math.cos(math.radians(25.0))
+"""Maximum angle between the direction of flight and the walls while avoiding obstacles."""
+_DEAD_END_M = 1.5
+"""Radius of a dead end, and distance of the goal ahead in unknown space."""
+_WALL_M = 2.0
+"""Distance at which a wall ahead ends a corridor, and within which its sides are viewed: a corridor that turns off
+there was seen at a grazing angle in passing."""
+_AT_END_M = 0.4
 _TURN_COST_M = 6.0
 """Cost of a turn by 180 degrees: corridors ahead are preferred to those that turn back."""
-_BLIND_M = 1.5
-"""Distance of the goal ahead in unknown space."""
-_BACK_M = 2.3
-"""Distance from an apparent end from within which its sides are viewed: a corridor that turns off there was seen at
-a grazing angle in passing."""
-_AT_END_M = 0.4
-_STANDS_S = 1.0
-"""Duration of a view at each heading: five depth maps, which show an entrance that was seen at a grazing angle."""
 _HOLDS_S = 2.0
 """Time for which a room, or an end without a view that is left, must hold: views arrive half a second late, and two
 free a cell."""
@@ -44,134 +44,178 @@ free a cell."""
 class FollowCorridor(Skill):
     """Follow the current corridor along its middle, through no known door."""
 
-    wall: bool = False
-    """Whether an obstacle is close ahead; without one, a missing continuation is no end of the corridor."""
-    _looks: Looks = field(default_factory=Looks)
-    _views: ViewPlanner = field(default_factory=lambda: ViewPlanner(_STANDS_S))
-    _trail: Trail | None = None
+    _trail: Places = field(default_factory=Places)
+    """Path flown, a metre apart."""
+    _began_w: FloatArray = field(default_factory=lambda: np.zeros(2))
+    """``(2,)`` unit vector of the heading at its first position."""
+    _heading_w: FloatArray = field(default_factory=lambda: np.zeros(2))
+    """``(2,)`` unit vector of the last new metre of flight; initially of the heading."""
+    _dead_ends: Places = field(default_factory=Places)
+    """Positions with no continuation ahead."""
     _end: Places = field(default_factory=Places)
     """Apparent end of the corridor, if it appears to end now."""
     _viewed_s: float = math.nan
     """Since when no view of the apparent end is left, and the drone is back there."""
     _wide_s: float = math.nan
-    _target: Places = field(default_factory=Places)
-    """Current goal in a corridor that turns off."""
+    """Since when it is in a room."""
     _doors: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
     """``(2,)`` centre and unit normal of each exit."""
-    _doubtful: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
-    """The same for candidates, which may also be corridors with an entrance narrowed by depth errors."""
 
-    def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
+    def consider(self, exits: Sequence[Exit]) -> None:
         """Receive doors, which end a corridor."""
         self._doors = [(e.centre_w[:2], e.normal_w[:2]) for e in exits]
-        self._doubtful = [(c.centre_w, c.normal_w) for c in candidates]
 
-    def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """Goal cells ``(G, 2)``: wide space ahead, else a corridor that turns off, else narrow space straight ahead,
-        else a side corridor through a narrowed entrance, else viewpoints of the sides before the end."""
+    def goals(self, layer: Layer, state: DroneState, views: ViewPlanner) -> np.ndarray:
+        """Goal cells ``(G, 2)``: wide space ahead, else a corridor that turns off, else narrow or unknown space
+        straight ahead, else viewpoints of the sides before the end."""
         here = state.p_w[:2]
-        self._trail = self._trail or Trail.beginning(state)
-        self._trail.fly(state)
-        self._note_width(layer, state)
-        axis = self._trail.direction(layer, here)
-        self.wall = is_walled(layer, here, axis)
-        found = self._looks.worth(self._onward(layer, state, axis, self._trail), layer, state)
-        if len(found) or not len(self._end):
+        self._fly(state)
+        room = len(self._trail) > 1 and 2.0 * float(layer.clearance_at(here[None])[0]) > WIDEST_M
+        self._wide_s = _since(room, self._wide_s, state)
+        found = self._onward(layer, state)
+        if len(found):
             self._viewed_s = math.nan
             return found
-        cells = wide(layer, here)
-        cells = cells[self._end.away_m(layer.centres(cells).reshape(-1, 2)) < _BACK_M]
-        spots = self._views.goals(layer, state, found, cells)
-        at_end = self._end.is_near(here, _AT_END_M)
-        if len(spots) or self._views.looks_from(here) or not at_end:
-            self._viewed_s = math.nan
-        elif math.isnan(self._viewed_s):
-            self._viewed_s = state.stamp_s
+        cells = _wide(layer, here, _BERTH_M)
+        cells = cells[self._end.away_m(layer.centres(cells).reshape(-1, 2)) < _WALL_M]
+        spots, at_end = views.viewpoints(layer, state, cells), self._end.is_near(here, _AT_END_M)
+        self._viewed_s = _since(at_end and not len(spots), self._viewed_s, state)
         return spots if len(spots) or at_end else layer.cells(self._end.p_w)
 
-    def look_rad(self, state: DroneState) -> float | None:
-        """Headings of the view planner at an apparent end, else ahead."""
-        return self._views.heading_rad(state) if len(self._end) else None
+    def looks(self, state: DroneState, views: ViewPlanner) -> bool:
+        """To the sides at an apparent end."""
+        return len(self._end) > 0 and views.look_around(state)
 
     def result(self, state: DroneState, losses: int = 0) -> Result | None:
         """The corridor ended, or the drone has not flown a metre of one."""
-        viewed = state.stamp_s - self._viewed_s > _HOLDS_S
-        ends = viewed or losses >= FEW_LOSSES if len(self._end) else self._looks.over(state.stamp_s)
+        ends = state.stamp_s - self._viewed_s > _HOLDS_S or (len(self._end) > 0 and losses >= FEW_LOSSES)
         room = state.stamp_s - self._wide_s > _HOLDS_S
         result = super(FollowCorridor, self).result(state, losses)
-        if not (room or ends or result is not None):
-            return None
-        if self._trail is None or len(self._trail.places_w) < 2:
+        if (room or ends or result is not None) and len(self._trail) < 2:
             return Result(False, "there is no corridor here")
         if room:
             return Result(True, "the corridor opens into a room")
-        if ends:
-            ended = Result(True, "the corridor ends")
-            return ended if len(self._end) else Result(False, "neither a continuation nor an end is visible")
-        return result
+        return Result(True, "the corridor ends") if ends else result
 
-    def _onward(self, layer: Layer, state: DroneState, axis: FloatArray, trail: Trail) -> np.ndarray:
+    def _fly(self, state: DroneState) -> None:
+        """Add the position to the trail if it is a metre from all others; backing up adds none."""
         here = state.p_w[:2]
-        cells = self._left(layer, wide(layer, here))
-        places = layer.centres(cells)
-        if len(ahead := cells[is_ahead(places, here, axis) & trail.leads_on(places)]):
+        if not len(self._trail):
+            self._trail.add(state.views, here)
+            self._began_w = self._heading_w = np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad)])
+        trail_w = self._trail.p_w
+        away = np.linalg.norm(here - trail_w, axis=1)
+        last = int(np.argmin(away))
+        if away[last] >= _STEP_M:
+            shares = np.linspace(0.0, 1.0, int(away[last] / _STEP_M) + 1)[1:]
+            self._heading_w = (here - trail_w[last]) / away[last]
+            self._trail.add(state.views, trail_w[last] + shares[:, None] * (here - trail_w[last]))
+
+    def _direction(self, layer: Layer, here: FloatArray) -> FloatArray:
+        """Unit vector ``(2,)`` of the corridor: of its walls if close to the direction of flight, else the latter."""
+        angles = np.array(wall_directions(Walls(layer, layer.solid), here))
+        along = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        cosines = along @ self._heading_w
+        best = int(np.argmax(np.abs(cosines))) if len(angles) else -1
+        if best < 0 or abs(cosines[best]) < _ALONG_WALLS_COS:
+            return self._heading_w
+        return np.asarray(along[best] * np.sign(cosines[best]))
+
+    def _onward(self, layer: Layer, state: DroneState) -> np.ndarray:
+        """Where the corridor leads on ``(G, 2)``; sets or resets its end."""
+        here = state.p_w[:2]
+        axis = self._direction(layer, here)
+        cells = _wide(layer, here, _BERTH_M)
+        p_w = layer.centres(cells).reshape(-1, 2)
+        along = (p_w - here) @ axis
+        ahead = (along > _ARRIVED_M) & (along > SAME_COS * np.linalg.norm(p_w - here, axis=1)) & self._leads_on(p_w)
+        if ahead.any():
             self._end = Places()
-            return far_middle(layer, ahead, axis)
-        trail.end(state)
-        if len(off := cells[trail.turns_off(places, here)]):
-            return self._nearest(layer, off, state, axis)
-        narrow = straight(layer, here, axis, self._to_door(here, axis))
+            return _far_middle(layer, cells[ahead], axis)
+        if not self._dead_ends.is_near(here, _AT_END_M):
+            self._dead_ends.add(state.views, here)
+        off = self._turns_off(p_w, here)
+        if off.any():
+            far = np.linalg.norm(p_w[off] - here, axis=1)
+            cost = far + _TURN_COST_M * (1.0 - along[off] / np.maximum(far, 1e-6))
+            return np.asarray(cells[off][[int(np.argmin(cost))]])
+        cells = _wide(layer, here, _NARROW_M, (axis, _ARRIVED_M))
+        p_w = layer.centres(cells).reshape(-1, 2)
+        along = (p_w - here) @ axis
+        straight = (along > _ARRIVED_M) & (along < self._to_door(here, axis))
         if len(self._end):  # space between here and the wall leads nowhere
-            narrow = narrow[trail.leads_on(layer.centres(narrow))]
-        if len(narrow := self._left(layer, far_middle(layer, narrow, axis))):
-            return narrow
-        if not self.wall and not len(self._end):
-            return layer.cells(here + _BLIND_M * axis)[None]
-        if not len(self._end):
-            self._end = Places(state.views, here)
-        cells = self._left(layer, wide(layer, here, SMEARED_BERTH_M))
-        places = layer.centres(cells)
-        off = cells[trail.turns_off(places, here) & self._is_this_side(places, here)]
-        return self._nearest(layer, off, state, axis) if len(off) else off
+            straight &= self._leads_on(p_w)
+        if straight.any():
+            return _far_middle(layer, cells[straight], axis)
+        if not len(self._end) and not _is_walled(layer, here, axis):
+            return layer.cells(here + _DEAD_END_M * axis)[None]
+        self._end = self._end if len(self._end) else Places(state.views, here)
+        return cells[:0]
 
-    def _left(self, layer: Layer, cells: np.ndarray) -> np.ndarray:
-        """Cells ``(N, 2)`` that were not inspected without success."""
-        return cells[self._looks.left(layer.centres(cells))]
+    def _leads_on(self, p_w: FloatArray) -> np.ndarray:
+        """Which of the points ``(N, 2)`` are in no dead end."""
+        return np.asarray(self._dead_ends.away_m(p_w) > _DEAD_END_M)
 
-    def _nearest(self, layer: Layer, cells: np.ndarray, state: DroneState, axis: FloatArray) -> np.ndarray:
-        """Nearest cell ``(1, 2)`` of corridors that turn off, with hysteresis."""
-        places = layer.centres(cells)
-        step = places - state.p_w[:2]
-        far = np.linalg.norm(step, axis=1)
-        cost = far + _TURN_COST_M * (1.0 - (step @ axis) / np.maximum(far, 1e-6))
-        if len(self._target):
-            cost -= 0.5 * (np.linalg.norm(places - self._target.last_w, axis=1) < 0.7)
-        best = int(np.argmin(cost))
-        self._target = Places(state.views, places[best])
-        return cells[[best]]
-
-    def _is_this_side(self, p_w: FloatArray, here: FloatArray) -> np.ndarray:
-        """Which of the points ``(N, 2)`` are not behind a door, taken as wide as the widest corridor."""
-        good = np.ones(len(p_w), dtype=bool)
-        for middle, normal in self._doors:
-            behind = ((p_w - middle) @ normal) * float((here - middle) @ normal) < 0.0
-            good &= ~(behind & (np.abs(aside(p_w - middle, normal)) < PASSED_M))
-        return good
+    def _turns_off(self, p_w: FloatArray, here: FloatArray) -> np.ndarray:
+        """Which of the points ``(N, 2)`` lie neither in the corridor flown up to here nor behind its start."""
+        step = p_w - self._trail.p_w[0]
+        behind = (step @ self._began_w < 0.0) & (np.abs(aside(step, self._began_w)) < _SAME_CORRIDOR_M)
+        flown = np.minimum(self._trail.away_m(p_w), np.linalg.norm(p_w - here, axis=1)) <= _SAME_CORRIDOR_M
+        return np.asarray(~flown & ~behind)
 
     def _to_door(self, here: FloatArray, axis: FloatArray) -> float:
         """Distance straight ahead to the first door across the corridor [m]; infinite without one."""
         ways = [
             float((middle - here) @ axis)
-            for middle, normal in (*self._doors, *self._doubtful)
-            if abs(float(normal @ axis)) > SAME_COS and abs(float(aside(middle - here, axis))) < PASSED_M
+            for middle, normal in self._doors
+            if abs(float(normal @ axis)) > SAME_COS and abs(float(aside(middle - here, axis))) < _SAME_CORRIDOR_M
         ]
         return min([way for way in ways if way > 0.0], default=math.inf)
 
-    def _note_width(self, layer: Layer, state: DroneState) -> None:
-        """Detect a room: all space within half a corridor's width is known to be free."""
-        assert self._trail is not None
-        away = float(layer.clearance_at(state.p_w[None, :2])[0])
-        if 2.0 * away <= WIDEST_M or len(self._trail.places_w) < 2:
-            self._wide_s = math.nan
-        elif math.isnan(self._wide_s):
-            self._wide_s = state.stamp_s
+
+def aside(step: FloatArray, axis: FloatArray) -> FloatArray:
+    """Component of steps ``(..., 2)`` to the left of an axis ``(2,)``.
+
+    Example:
+        >>> aside(np.array([3.0, 0.5]), np.array([1.0, 0.0]))
+        array(0.5)
+    """
+    return np.asarray(step[..., 1] * axis[0] - step[..., 0] * axis[1])
+
+
+def _since(holds: bool, since_s: float, state: DroneState) -> float:
+    """Since when a condition holds; NaN if it does not."""
+    if not holds:
+        return math.nan
+    return state.stamp_s if math.isnan(since_s) else since_s
+
+
+def _wide(layer: Layer, here: FloatArray, berth_m: float, strip: tuple[FloatArray, float] | None = None) -> np.ndarray:
+    """Cells ``(N, 2)`` of the connected free space with this clearance around the drone, perhaps only those in a strip:
+    its axis ``(2,)`` and half width."""
+    open_ = layer.free & (layer.from_solid_m >= berth_m)
+    if strip is not None:
+        centres = layer.centres(np.moveaxis(np.indices(open_.shape), 0, -1))
+        open_ &= np.abs(aside(centres - here, strip[0])) < strip[1]
+    cells = np.argwhere(open_)
+    away = np.linalg.norm(layer.centres(cells).reshape(-1, 2) - here, axis=1)
+    if away.min(initial=math.inf) > _STEP_M:
+        return cells[:0]
+    return np.argwhere(layer.part_around(open_, layer.centres(cells[int(np.argmin(away))])))
+
+
+def _far_middle(layer: Layer, cells: np.ndarray, axis: FloatArray) -> np.ndarray:
+    """Middle one ``(1, 2)`` of the cells ``(N, 2)`` that lie farthest along an axis."""
+    along = layer.centres(cells) @ axis
+    last = cells[along > along.max() - 3.0 * layer.cell_m]
+    left = aside(layer.centres(last), axis)
+    return np.asarray(last[[int(np.argmin(np.abs(left - np.median(left))))]])
+
+
+def _is_walled(layer: Layer, here: FloatArray, axis: FloatArray) -> bool:
+    """Whether an obstacle is close ahead, within half a door's width to each side."""
+    steps = np.arange(0.3, _WALL_M, 0.5 * layer.cell_m)
+    left = np.array([-axis[1], axis[0]])
+    rays = here + steps[:, None, None] * axis + np.array([[-0.5], [0.0], [0.5]]) * left
+    cells = layer.cells(rays)
+    return bool(layer.solid[cells[..., 0], cells[..., 1]].any())

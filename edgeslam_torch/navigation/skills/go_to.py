@@ -9,6 +9,7 @@ from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.skills.skill import FEW_LOSSES, Result, Skill
 from edgeslam_torch.navigation.supervisor import DEAD_RECKONING_SIGMA_M
+from edgeslam_torch.navigation.views import ViewPlanner
 from edgeslam_torch.types import FloatArray
 
 ARRIVED_M = 0.15
@@ -29,7 +30,7 @@ class GoTo(Skill):
     there: str = "there"
     """Reason of its result."""
 
-    def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
+    def goals(self, layer: Layer, state: DroneState, views: ViewPlanner) -> np.ndarray:
         """The goal's cell, or the last cell of the grid towards it."""
         low = layer.corner_w + layer.cell_m
         high = layer.corner_w + (np.array(layer.free.shape) - 1) * layer.cell_m

@@ -6,17 +6,19 @@ A skill chooses where to go (goal cells), where to look, and when to end; the pl
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
+from edgeslam_torch.navigation.openings.exit_tracker import Exit
+from edgeslam_torch.navigation.views import ViewPlanner
 
 MOST_LOSSES, FEW_LOSSES = 5, 3
 """Tracking losses at one place that end a skill: a view of a textureless surface fails repeatedly; and that end it at
 its goal."""
+ROUND_S = 15.0
+"""Time without progress after which obstacles are observed anew, and then a skill ends: a full look around."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +38,10 @@ NO_WAY = Result(False, "no way")
 class Skill:
     """Base of all skills: it goes nowhere, faces the direction of flight, and ends by its timeout."""
 
-    moves: ClassVar[bool] = True
-    """Whether it flies anywhere."""
     until_s: float = field(default=math.inf, kw_only=True)
     """Timeout on the clock of the states."""
 
-    def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
+    def goals(self, layer: Layer, state: DroneState, views: ViewPlanner) -> np.ndarray:
         """Goal cells ``(G, 2)``; by default the current one. Called at every plan."""
         return layer.cells(state.p_w[:2])[None]
 
@@ -51,12 +51,12 @@ class Skill:
             return TIME_OVER
         return LOST_REPEATEDLY if losses >= MOST_LOSSES else None
 
-    def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
-        """Receive undecided openings and exits."""
+    def consider(self, exits: Sequence[Exit]) -> None:
+        """Receive the exits known so far."""
 
-    def look_rad(self, state: DroneState) -> float | None:
-        """Heading to turn to while hovering; None to fly on."""
-        return None
+    def looks(self, state: DroneState, views: ViewPlanner) -> bool:
+        """Whether to hover and look; the view planner then takes the view. Called while it takes none."""
+        return False
 
     def faces_rad(self, state: DroneState) -> float | None:
         """Heading to keep during slow flight through known space; None to face the direction of flight."""

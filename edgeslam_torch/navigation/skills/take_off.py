@@ -2,10 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.skills.skill import NO_WAY, Result, Skill
+from edgeslam_torch.navigation.views import ViewPlanner
 
 _TIMEOUT_S = 40.0
 """The metric scale takes up to 20 s, a second map as long."""
@@ -19,7 +19,6 @@ class TakeOff(Skill):
         height_m: Flight height.
     """
 
-    moves: ClassVar[bool] = False
     height_m: float
     _began_s: float = math.nan
 
@@ -29,3 +28,7 @@ class TakeOff(Skill):
         if state.metric and abs(state.p_w[2] - self.height_m) < 0.1:
             return Result(True, "in the air")
         return NO_WAY if state.stamp_s - self._began_s > _TIMEOUT_S else None
+
+    def looks(self, state: DroneState, views: ViewPlanner) -> bool:
+        """It hovers."""
+        return True

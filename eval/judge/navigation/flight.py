@@ -206,7 +206,8 @@ def shortest_m(site: Site, limits: NavLimits) -> float:
     """Length [m] of the shortest path from start to goal in the true map under the planner's limits; infinite if there
     is none."""
     layer, start = true_layer(site, limits), np.zeros(2)
-    plan = cost_to_go(layer, layer.cells(site.goal_w[None, :2]), limits.clearance_m(0.0), layer.cells(start))
+    need_m = limits.clearance_m(0.0)
+    plan = cost_to_go(layer, layer.cells(site.goal_w[None, :2]), need_m, need_m, layer.cells(start))
     way = plan.way(start, 100.0)
     return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()) if np.isfinite(plan.at(start)) else float("inf")
 

@@ -1,1 +1,0 @@
-"""Exploration: frontiers, coverage by the camera, and second looks at candidate openings."""
