@@ -22,6 +22,8 @@ class Arcs:
 
     velocity_w: FloatArray
     """``(C, 2)`` commanded velocity [m/s]."""
+    share: FloatArray
+    """``(C,)`` speed over the cruising speed."""
     p_w: FloatArray
     """``(C, S, 2)`` predicted positions until standstill [m]."""
     clearance_m: FloatArray
@@ -52,15 +54,16 @@ def candidates(
         velocity_w: Velocity ``(2,)`` [m/s].
         ahead_rad: Bearing of the path, one of the directions.
         limits: Latency and time constant of the drone.
-        speed_m_s: Highest speed.
+        speed_m_s: Cruising speed.
         blind: Whether the drone flies by dead reckoning, so that velocities below the quantisation step are useless.
     """
     angle = ahead_rad + 2 * np.pi * np.arange(_HEADINGS) / _HEADINGS
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    wanted = np.concatenate([np.zeros((1, 2)), *(speed_m_s * s * unit for s in _SPEEDS)])
+    share = np.repeat([0.0, *_SPEEDS], [1, *[_HEADINGS] * len(_SPEEDS)])
+    wanted = speed_m_s * share[:, None] * np.concatenate([np.zeros((1, 2)), *[unit] * len(_SPEEDS)])
     wanted = measurable(wanted) if blind else wanted
     p = flown(np.asarray(p_w, dtype=np.float64), np.asarray(velocity_w, dtype=np.float64), wanted, limits)
-    return Arcs(wanted, p, layer.clearance_at(p).min(axis=1), layer.from_solid_at(p).min(axis=1))
+    return Arcs(wanted, share, p, layer.clearance_at(p).min(axis=1), layer.from_solid_at(p).min(axis=1))
 
 
 def flown(p_w: FloatArray, velocity_w: FloatArray, wanted_w: FloatArray, limits: NavLimits) -> FloatArray:

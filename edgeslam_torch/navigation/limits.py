@@ -9,7 +9,7 @@ class NavLimits:
     """Limits that planner and supervisor enforce."""
 
     speed_m_s: float = 0.5
-    """Cruising speed in free space."""
+    """Mean cruising speed in free space; it varies by half a step of the reported velocity (`speed_dither`)."""
     turn_rad_s: float = math.radians(60.0)
     climb_m_s: float = 0.3
     height_m: float = 1.15

@@ -268,9 +268,9 @@ class Pilot:
     def _chosen(self, state: DroneState, plan: CostToGo, ahead: float, error: float) -> FloatArray | None:
         """World velocity ``(2,)`` of the best candidate; None if hovering is as good."""
         assert self.layer is not None
-        fastest = dithered(self.limits.speed_m_s, state.stamp_s)
+        speed_m_s = dithered(self.limits.speed_m_s, state.stamp_s)
         here, blind = state.p_w[:2], not state.tracked
-        arcs = candidates(self.layer, here, state.velocity_w[:2], ahead, self.limits, fastest, blind)
+        arcs = candidates(self.layer, here, state.velocity_w[:2], ahead, self.limits, speed_m_s, blind)
         need = self.limits.clearance_m(state.position_sigma_m)
         standing = float(arcs.clearance_m[0])
         good = arcs.clearance_m >= need
@@ -291,7 +291,7 @@ class Pilot:
         Cells within 0.6 m beside the drone lie outside the vertical field of view, and a door frame that was passed was
         never seen from behind.
         """
-        slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SLOW * self.limits.speed_m_s + 1e-6
+        slow = arcs.share <= _SLOW
         hull_m = self._hull_m(state)
         beside = arcs.from_solid_m >= self.limits.clearance_m(state.position_sigma_m)
         # After a start over, unknown cells may be obstacles that were reset.
@@ -307,7 +307,7 @@ class Pilot:
         """Cost to go after each candidate plus a penalty for low clearance; infinite for fast ones outside the view."""
         away = arcs.from_solid_m if self._views.exhausted.is_near(state.p_w[:2], PLACES_M) else arcs.clearance_m
         score = np.asarray(plan.at(arcs.end_w)) + 0.5 * np.clip(TIGHT_M - away, 0.0, None)
-        fast = np.linalg.norm(arcs.velocity_w, axis=1) > _SIDEWAYS * self.limits.speed_m_s + 1e-6
+        fast = arcs.share > _SIDEWAYS
         off = np.abs(wrapped(np.arctan2(arcs.velocity_w[:, 1], arcs.velocity_w[:, 0]) - state.yaw_rad))
         score[fast & ((off > _FACING_RAD) | (abs(error) > _FACING_RAD))] = np.inf
         return score

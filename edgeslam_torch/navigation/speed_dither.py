@@ -14,14 +14,14 @@ _VARIES_S = 4.0
 """Period of the triangle wave."""
 
 
-def dithered(fastest_m_s: float, stamp_s: float) -> float:
-    """Speed [m/s] at a time: a triangle wave from ``fastest_m_s`` down by one step, at most by half of it.
+def dithered(mean_m_s: float, stamp_s: float) -> float:
+    """Speed [m/s] at a time: a triangle wave over one step, at most over a third of the mean to each side.
 
     >>> [round(dithered(0.5, t), 2) for t in (0.0, 1.0, 2.0, 3.0)]
-    [0.4, 0.45, 0.5, 0.45]
+    [0.45, 0.5, 0.55, 0.5]
     """
     share = abs(2.0 * (stamp_s / _VARIES_S % 1.0) - 1.0)
-    return fastest_m_s - min(STEP_M_S, 0.5 * fastest_m_s) * share
+    return mean_m_s + min(STEP_M_S, 2.0 / 3.0 * mean_m_s) * (0.5 - share)
 
 
 def measurable(velocity_w: FloatArray) -> FloatArray:

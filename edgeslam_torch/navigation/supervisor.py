@@ -14,7 +14,7 @@ from edgeslam_torch.navigation.contact import PUSHED_M_S, Push
 from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.map_views import MapViews, Places
-from edgeslam_torch.navigation.speed_dither import STEP_M_S, dithered, measurable
+from edgeslam_torch.navigation.speed_dither import dithered, measurable
 from edgeslam_torch.types import FloatArray
 
 STALE_S = 0.3
@@ -305,7 +305,7 @@ class Supervisor:
         if len(self._trail) == 0:
             return VelocityCommand(why=f"{danger}: hover")
         step = self._trail.last_w[:2] - here
-        speed_m_s = dithered(_BACK_M_S + 0.5 * STEP_M_S, trouble_s)
+        speed_m_s = dithered(_BACK_M_S, trouble_s)
         v_w = measurable(step * (speed_m_s / float(np.linalg.norm(step))))
         c, s = math.cos(self._state.yaw_rad), math.sin(self._state.yaw_rad)
         return VelocityCommand(

@@ -63,7 +63,7 @@ class FlightView:
         self._log(
             "speed/wanted", rr.Scalars(math.hypot(moment.order.command.forward_m_s, moment.order.command.left_m_s))
         )
-        self._log("speed/limit", rr.Scalars(moment.pilot.limits.speed_m_s))
+        self._log("speed/cruising", rr.Scalars(moment.pilot.limits.speed_m_s))
         self._say(moment)
         if not state.stamp_s - self._shown_s < _EVERY_S:  # also the first time
             self._shown_s = state.stamp_s
@@ -116,7 +116,7 @@ def _raised(p_w: FloatArray, height_m: float) -> FloatArray:
 def _layout(rrb: Any) -> Any:
     """Layout of the window."""
     beside = rrb.Vertical(
-        rrb.TimeSeriesView(origin="speed", name="speed: flown, wanted, limit [m/s]"),
+        rrb.TimeSeriesView(origin="speed", name="speed: flown, wanted, cruising [m/s]"),
         rrb.TextLogView(origin="reasons", name="phase and reason"),
     )
     scene = rrb.Spatial3DView(origin="world", name="space and path")

@@ -185,7 +185,7 @@ def test_dithered_speed_averages_out_truncation():
         speeds.append(command.forward_m_s)
     way, read = sum(speeds), sum(math.floor(10.0 * v) / 10.0 + 0.05 for v in speeds)
     assert read == pytest.approx(way, rel=0.02)
-    assert 0.39 < min(speeds) < 0.42 and 0.48 < max(speeds) <= 0.5
+    assert 0.44 < min(speeds) < 0.47 and 0.53 < max(speeds) <= 0.55
 
 
 @pytest.mark.parametrize("tracked", [True, False])
