@@ -240,3 +240,12 @@ def test_exploration_goes_on_while_there_is_an_opening_to_look_at():
         planner.openings = [DOOR] * int(now_s > 5.0)
         assert (len(task.goals(room(), at(0.5, 1.0, now_s=now_s), planner)) > 0) == (now_s > 5.0)
         assert not task.result(at(0.5, 1.0, now_s=now_s))
+
+
+def test_exploration_does_not_end_while_the_supervisor_flies():
+    """It shows nothing new meanwhile, as when the scale is awaited after the take-off."""
+    task, planner = Explore(), considering()
+    for now_s in np.arange(0.0, 40.0, 0.5):
+        state = replace(at(0.5, 1.0, now_s=now_s), overridden=now_s < 20.0)
+        assert not len(task.goals(room(), state, planner))
+        assert bool(task.result(state)) == (now_s > 35.0)

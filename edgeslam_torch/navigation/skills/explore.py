@@ -9,7 +9,7 @@ import numpy as np
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
-from edgeslam_torch.navigation.skills.skill import ROUND_S, Result, Skill
+from edgeslam_torch.navigation.skills.skill import ROUND_S, Result, Skill, since_s
 from edgeslam_torch.navigation.views import ViewPlanner
 
 
@@ -23,10 +23,7 @@ class Explore(Skill):
     def goals(self, layer: Layer, state: DroneState, views: ViewPlanner) -> np.ndarray:
         """Viewpoints of borders of the free space, and of undecided openings."""
         found = views.viewpoints(layer, state)
-        if len(found):
-            self._nothing_s = math.nan
-        elif math.isnan(self._nothing_s):
-            self._nothing_s = state.stamp_s
+        self._nothing_s = since_s(not len(found), self._nothing_s, state)
         return found
 
     def result(self, state: DroneState, losses: int = 0) -> Result | None:

@@ -12,7 +12,7 @@ from edgeslam_torch.navigation.map_views import Places
 from edgeslam_torch.navigation.openings.exit_tracker import SAME_COS, Exit
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
 from edgeslam_torch.navigation.openings.wall_frame import Walls, wall_directions
-from edgeslam_torch.navigation.skills.skill import FEW_LOSSES, Result, Skill
+from edgeslam_torch.navigation.skills.skill import FEW_LOSSES, Result, Skill, since_s
 from edgeslam_torch.navigation.views import ViewPlanner
 from edgeslam_torch.types import FloatArray
 
@@ -71,7 +71,7 @@ class FollowCorridor(Skill):
         here = state.p_w[:2]
         self._fly(state)
         room = len(self._trail) > 1 and 2.0 * float(layer.clearance_at(here[None])[0]) > WIDEST_M
-        self._wide_s = _since(room, self._wide_s, state)
+        self._wide_s = since_s(room, self._wide_s, state)
         found = self._onward(layer, state)
         if len(found):
             self._viewed_s = math.nan
@@ -79,7 +79,7 @@ class FollowCorridor(Skill):
         cells = _wide(layer, here, _BERTH_M)
         cells = cells[self._end.away_m(layer.centres(cells).reshape(-1, 2)) < _WALL_M]
         spots, at_end = views.viewpoints(layer, state, cells), self._end.is_near(here, _AT_END_M)
-        self._viewed_s = _since(at_end and not len(spots), self._viewed_s, state)
+        self._viewed_s = since_s(at_end and not len(spots), self._viewed_s, state)
         return spots if len(spots) or at_end else layer.cells(self._end.p_w)
 
     def looks(self, state: DroneState, views: ViewPlanner) -> bool:
@@ -181,13 +181,6 @@ def aside(step: FloatArray, axis: FloatArray) -> FloatArray:
         array(0.5)
     """
     return np.asarray(step[..., 1] * axis[0] - step[..., 0] * axis[1])
-
-
-def _since(holds: bool, since_s: float, state: DroneState) -> float:
-    """Since when a condition holds; NaN if it does not."""
-    if not holds:
-        return math.nan
-    return state.stamp_s if math.isnan(since_s) else since_s
 
 
 def _wide(layer: Layer, here: FloatArray, berth_m: float, strip: tuple[FloatArray, float] | None = None) -> np.ndarray:

@@ -61,3 +61,10 @@ class Skill:
     def faces_rad(self, state: DroneState) -> float | None:
         """Heading to keep during slow flight through known space; None to face the direction of flight."""
         return None
+
+
+def since_s(holds: bool, before_s: float, state: DroneState) -> float:
+    """Since when a condition holds, given the same for the last state; NaN if it does not, or the supervisor flies."""
+    if not holds or state.overridden:
+        return math.nan
+    return state.stamp_s if math.isnan(before_s) else before_s
