@@ -8,9 +8,13 @@ import numpy as np
 
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.openings.exit_tracker import Exit
-from edgeslam_torch.navigation.skills.skill import ROUND_S, Result, Skill, since_s
+from edgeslam_torch.navigation.skills.skill import Result, Skill, since_s
 from edgeslam_torch.navigation.views import ViewPlanner
+
+_TURN_S = 4.0 * math.pi / NavLimits().turn_rad_s
+"""Duration of the full turn, at half the rate, by which the pilot looks around without a path."""
 
 
 @dataclass(slots=True)
@@ -28,7 +32,7 @@ class Explore(Skill):
 
     def result(self, state: DroneState, losses: int = 0) -> Result | None:
         """Reached when nothing is left to explore; tracking losses do not end it, since other places remain."""
-        if state.stamp_s - self._nothing_s > ROUND_S:
+        if state.stamp_s - self._nothing_s > _TURN_S:
             return Result(True, "nothing is left to explore")
         return super(Explore, self).result(state)
 
