@@ -276,9 +276,11 @@ class ViewPlanner:
     def _targets(self) -> Targets:
         """Borders and openings."""
         left, some = self._left, np.ones(len(self.openings))
+        centre_w = np.array([opening.centre_w for opening in self.openings]).reshape(-1, 2)
+        normal_w = np.array([-opening.normal_w for opening in self.openings]).reshape(-1, 2)
         return Targets(
-            np.array([*left.p_w, *(opening.centre_w for opening in self.openings)]).reshape(-1, 2),
-            np.array([*left.normal_w, *(-opening.normal_w for opening in self.openings)]).reshape(-1, 2),
+            np.concatenate([left.p_w, centre_w]),
+            np.concatenate([left.normal_w, normal_w]),
             np.concatenate([left.range_m, some[:, None] * _BEFORE_M]),
             np.concatenate([left.cos, some * _BEFORE_COS]),
             np.concatenate([left.width_m, some * NARROWEST_M]),
