@@ -54,5 +54,5 @@ class Signals:
 
 
 def say(text: str) -> None:
-    """Print at once."""
-    print(text, flush=True)
+    """Print a line at once, and whole: another thread may print, too."""
+    print(f"{text}\n", end="", flush=True)
