@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Write ``STEM.npy`` (float32 metres), ``STEM.png`` (16-bit millimetres) and ``STEM_colour.png`` per
     image."""
-    from edgeslam_torch.frontend.depth_check import MIN_SHARE
+    from edgeslam_torch.frontend.depth_check import MIN_SHARE, CheckedDepth
     from edgeslam_torch.frontend.depth_network import open_depth, weights_path
     from edgeslam_torch.terminal.progress import counted
 
@@ -66,13 +66,16 @@ def main(args: argparse.Namespace) -> int:
     camera, frames, length, warnings, problems = _frames(args.source, args.camera, args.max_frames)
     for warning in warnings:
         print(f"note: {warning}")
+    checked, contradiction = CheckedDepth(network), ""
     shares: list[float] = []
     stems: set[str] = set()
     try:
         args.out.mkdir(parents=True, exist_ok=True)
         for frame in counted(frames, "depth", "image", length):
             _spare_the_source(args.out, frame.path)
-            depth = network(np.asarray(camera.undistort_image(frame.image), np.uint8), camera)
+            image = np.asarray(camera.undistort_image(frame.image), np.uint8)
+            depth = network(image, camera)
+            contradiction = checked.contradiction(depth, image, camera)
             depth, share = _believable(depth)
             shares.append(share)
             stem = _stem(frame, stems)
@@ -88,6 +91,8 @@ def main(args: argparse.Namespace) -> int:
     unknown = sum(share < MIN_SHARE for share in shares)
     if unknown:
         print(f"note: {unknown} of {len(shares)} depth maps are mostly unknown: these weights do not fit these images")
+    if contradiction:
+        print(f"warning: {contradiction}: are these maps in metres?")
     lens = ", lens distortion removed" if camera.is_distorted else ""
     print(f"{len(shares)} depth maps in {args.out} (metres for {camera.source}{lens}; {network.backend})")
     return 0

@@ -81,23 +81,23 @@ class CheckedDepth:
         if share < MIN_SHARE:
             self._refuse(share)
             return None
-        if self._contradicted(depth, image, camera):
+        if said := self.contradiction(depth, image, camera):
+            if not self._said_contradiction:
+                self._said_contradiction = True
+                logger.warning(f"{said}: its depth is not used")
             return None
         return depth if share == 1.0 else replace(depth, depth_m=np.where(good, depth.depth_m, np.float32(np.nan)))
 
-    def _contradicted(self, depth: DepthMap, image: np.ndarray, camera: Camera) -> str | None:
-        """The contradiction with the reference in most maps so far; None if there is none."""
+    def contradiction(self, depth: DepthMap, image: np.ndarray, camera: Camera) -> str:
+        """How most maps so far, with this one, contradict the reference; empty if they do not."""
         if len(self._contradictions) < ORDER_MAPS and (reference := getattr(self.depth, "reference", None)) is not None:
             said = self.depth.contradiction(depth, image, camera, reference(image, camera))  # type: ignore[attr-defined]
             self._contradictions.append(said)
-            if said and self._contradiction() and not self._said_contradiction:
-                self._said_contradiction = True
-                logger.warning(self._contradiction())
         return self._contradiction()
 
-    def _contradiction(self) -> str | None:
+    def _contradiction(self) -> str:
         named = [said for said in self._contradictions if said]
-        return f"{named[0]}: its depth is not used" if 2 * len(named) > len(self._contradictions) else None
+        return named[0] if 2 * len(named) > len(self._contradictions) else ""
 
     def _refuse(self, share: float) -> None:
         self.refused += 1
@@ -112,7 +112,7 @@ class CheckedDepth:
     def warning(self) -> str | None:
         """Warning about rejected maps; None if there were none."""
         if contradiction := self._contradiction():
-            return contradiction
+            return f"{contradiction}: its depth is not used"
         if not self.refused:
             return None
         return (

@@ -13,10 +13,11 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from small_networks import RELATIVE, describe, green_network
+from small_networks import FAR_M, NEAR_M, RELATIVE, describe, green_network
 
 from edgeslam_torch.errors import ConfigError, EdgeSlamError
 from edgeslam_torch.frontend.depth_network import DepthPredictor
+from edgeslam_torch.frontend.external_depth import ExternalDepth
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
@@ -209,6 +210,18 @@ def test_depth_maps_of_a_relative_network_would_have_no_unit(pictures, tmp_path)
     network = describe(green_network(tmp_path / "n.onnx", **RELATIVE), 'preset = "midas-small"\n')
     with pytest.raises(ConfigError, match="up to scale and shift"):
         run("depth", pictures, "--out", tmp_path / "out", "--weights", network)
+
+
+def test_numbers_that_are_not_as_described_are_said(pictures, tmp_path, capsys, monkeypatch):
+    def reference(image, camera):
+        depth_m = NEAR_M + (FAR_M - NEAR_M) * image[:, :, 1] / np.float32(255.0)
+        return DepthMap(depth_m, np.full_like(depth_m, 0.1))
+
+    monkeypatch.setattr(ExternalDepth, "reference", staticmethod(reference))
+    logarithm = [onnx.helper.make_node("Log", ["depth"], ["log"])]
+    network = describe(green_network(tmp_path / "n.onnx", logarithm, "log"), 'gives = "metres"\n')
+    assert run("depth", pictures, "--out", tmp_path / "out", "--weights", network) == 0
+    assert "gives = 'log_metres'" in capsys.readouterr().out
 
 
 def test_network_of_others_is_inspected_by_its_description(tmp_path, capsys):
