@@ -136,6 +136,7 @@ class MotionFusion:
             last = self._memory.last
             if np.isfinite(T).all() and (last is None or stamp_s > last.stamp_s):
                 self._memory.add(VisualPose(stamp_s, T, sigma_t, sigma_r_rad))
+        self._fit_imu()
 
     def revise(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
         """Replace earlier poses by refined ones.

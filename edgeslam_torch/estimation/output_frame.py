@@ -18,14 +18,15 @@ T_LEVEL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0
 """``T_w_c`` of a level camera that looks along world x: the first pose without attitude."""
 
 SURE = 0.15
-"""Maximum relative sigma of a scale that may revise the published one; depth networks reach 0.16 at best."""
+"""Maximum relative sigma of a scale that revises a published one of a similar sigma; depth networks reach 0.16 at
+best."""
 
 CONTRADICTION = 2.0
 """Deviation of the published scale that triggers a revision [sigmas]."""
 
 _IMPROVED = 0.5
 """Share of the published scale's sigma at which an estimate replaces it if it is off by more than the new sigma. The
-initial guess has an infinite one; an IMU's first estimate is good to a tenth, and to a hundredth ten seconds later."""
+initial guess has an infinite one; an IMU's first estimate is good to a half, and to a hundredth ten seconds later."""
 
 MEASURED = frozenset({"telemetry", "height", "imu"})
 """Sources that measure metres; the depth network has set the initial guess already."""
@@ -92,8 +93,8 @@ class OutputFrame:
         return replace(self, R=R, offset=self.offset + self.scale * ((self.R - R) @ centre_map))
 
     def revised(self, estimate: ScaleEstimate, centre_map: FloatArray) -> "OutputFrame":
-        """The same at an estimated scale, if that is measured, accurate, and contradicts the published one or is much
-        more accurate.
+        """The same at an estimated scale, if that is measured, and is much more accurate than the published one or
+        accurate and contradicts it.
 
         Args:
             estimate: Metres per map unit.
@@ -102,7 +103,7 @@ class OutputFrame:
         sigma = estimate.sigma / estimate.value
         better = sigma < _IMPROVED * self.sigma and self._off(estimate) > sigma
         measured = not MEASURED.isdisjoint(estimate.source.split("+"))
-        if not (measured and sigma < SURE and (better or self.contradicts(estimate))):
+        if not (measured and (better or (sigma < SURE and self.contradicts(estimate)))):
             return self
         offset = self.offset + (self.scale - estimate.value) * (self.R @ centre_map)
         return replace(self, scale=estimate.value, offset=offset, revision=self.revision + 1, sigma=sigma)

@@ -15,8 +15,8 @@ from edgeslam_torch.types import ScaleEstimate
 _BELIEVED = 0.3
 """Maximum relative sigma of a scale from telemetry."""
 _SURE = 0.15
-"""Maximum relative sigma of a scale from heights alone with which velocities constrain the map: with a scale that is
-wrong by several times they would distort it."""
+"""Relative sigma, that of the best depth networks, up to which velocities constrain a map whose scale is from heights
+alone (one that is wrong by several times would distort it), and above which a network adds to an IMU."""
 _FOCAL_SHARE = 0.4
 """Share of a focal length's relative error that the scale from telemetry inherits; set on recordings with focal lengths
 of 0.7 to 1.5 times the true one."""
@@ -92,9 +92,11 @@ class ScaleEstimator:
         """Which sources are used; cached, since it is read several times a frame."""
         depth = self._depth.scale()
         beliefs = [self._with_common(b) for b in self._by_telemetry.values()]
-        # An earlier flight's scale includes the network's; beside an IMU neither adds information.
-        network = self.network() if self._remembered is None else self._remembered
-        beliefs += [self.inertial] if self.inertial is not None else [network] if network is not None else []
+        network = self.network() if self._remembered is None else self._remembered  # which includes the network's
+        if self.inertial is not None:
+            beliefs.append(self.inertial)
+        if network is not None and (self.inertial is None or self.inertial.sigma > _SURE):
+            beliefs.append(network)
         if tuple(beliefs) != self._beliefs:
             self._beliefs = tuple(beliefs)
             self._decided = decide(beliefs, only_witness=depth is not None and not depth.in_domain)

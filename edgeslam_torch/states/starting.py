@@ -202,9 +202,9 @@ class Starting:
         self._attempt = None
         system = self.system
         system.log.replace(started.T_c_w, [reference, *(k for _, k in started.new)])
-        system.add_earlier(reference.stamp_s, track)
         system.motion.T_c_w = started.T_c_w[max(started.T_c_w)]
         system.motion.move(frame.stamp_s, keyframe.T_c_w)
+        system.add_earlier(reference.stamp_s, track)
         system.edges.announce(reference)
         system.compare_depth(reference)
         self.tracking.begin(seen, started.new)

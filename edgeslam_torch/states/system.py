@@ -145,10 +145,12 @@ class System:
         return self.published.scale * sigma_t, self.published.scale * self.graph.drift
 
     def add_earlier(self, since_s: float, track: Track) -> None:
-        """Pass logged frames since a stamp to the fusion once a map supports them; covariance from ``track``."""
+        """Pass logged frames since a stamp to the fusion once a map supports them, and publish the resulting scale;
+        covariance from ``track``."""
         stamps_s, T_w_c = self.log.poses(since_s)
         with self.timed("fusion"):
             self.fusion.add_earlier(stamps_s, T_w_c, *_sigmas(track))
+            self.published = self.fusion.republished(self.published, se3.inverse(self.motion.T_c_w)[:3, 3])
 
     def begin_submap(self, keyframe: Keyframe) -> None:
         """A submap begins with a keyframe at the present, predicted pose."""

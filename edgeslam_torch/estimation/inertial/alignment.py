@@ -28,6 +28,7 @@ from edgeslam_torch.noise import (
     IMU_AXES_RAD,
     IMU_BIAS_SIGMA,
     IMU_SCALE_LOG,
+    IMU_YOUNG_LOG_S2,
     KNOWN_LEVER_M,
     KNOWN_MOUNT_RAD,
     KNOWN_OFFSET_S,
@@ -38,8 +39,8 @@ from edgeslam_torch.noise import (
 )
 from edgeslam_torch.types import FloatArray
 
-LEAST_NODES = 24
-"""Minimum number of nodes, 2.5 s: of fewer, the size of their errors is too uncertain."""
+LEAST_NODES = 6
+"""Minimum number of nodes, half a second."""
 _STEPS, _METRIC_STEPS = 12, 4
 """Iterations; the first ones linear in the scale itself, whose start is arbitrary."""
 _CONVERGED, _LARGEST_LOG = 0.05, 20.0
@@ -91,7 +92,8 @@ class Alignment:
     @property
     def sigma_log_scale(self) -> float:
         """Standard deviation of the log scale."""
-        return math.hypot(math.sqrt(self.covariance[_SCALE, _SCALE]), IMU_SCALE_LOG)
+        systematic = math.hypot(IMU_SCALE_LOG, IMU_YOUNG_LOG_S2 / (self.stamps_s[-1] - self.stamps_s[0]) ** 2)
+        return math.hypot(math.sqrt(self.covariance[_SCALE, _SCALE]), systematic)
 
     @property
     def sigma_up_rad(self) -> float:

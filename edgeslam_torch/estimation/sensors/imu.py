@@ -14,15 +14,15 @@ from edgeslam_torch.geometry.rotations import fitted_rotation, smallest_rotation
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.types import FloatArray
 
-KNOWN_LOG = 0.15
-"""Maximum standard deviation of the log of an observable scale: that of the best depth networks."""
+KNOWN_LOG = 0.5
+"""Maximum standard deviation of the log of an observable scale."""
 _LEAST_EXCITATION = 3.0
 """Minimum of `Alignment.excitation` of an observable scale."""
 _NODE_S = 0.09
 """Minimum time between two poses of an alignment: those of images are given at 10 Hz."""
 REACH_S = 60.0
 """Length of way that a fit in flight takes: a map's scale drifts over longer ones."""
-_REFIT_S, _REFIT_SHARE = 1.0, 0.12
+_REFIT_S, _REFIT_SHARE = 0.2, 0.12
 """Time between fits, and as a share of the time so far: later fits cost more and change less."""
 _CONTRADICTED_RAD = math.radians(3.0)
 """Size of the errors of visual rotations beyond which gyroscope and images do not move together; in flight they are
