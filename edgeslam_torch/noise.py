@@ -44,6 +44,8 @@ HEADING_RAD = math.radians(0.5)
 """Of one heading: quantisation to whole degrees, and the error of the camera mount in a turn."""
 HEADING_DRIFT_RAD_S = math.radians(0.02)
 """Of the gyroscope's drift rate: a degree per minute."""
+MAP_TURN_RAD = math.radians(5.0)
+"""Of headings in the keyframes of a window before their refinement."""
 TURN_SHARE = 0.005
 """Of a rotation, relative: scale factor of the gyroscope, error of the focal length."""
 TILT_RAD = math.radians(2.0)
@@ -71,8 +73,8 @@ IMU_SCALE_LOG = 0.01
 tracker of a real flight; data sheets allow 3 % (MPU-6050)."""
 IMU_YOUNG_LOG_S2 = 0.4
 """Error of the scale by a map that bends in its first seconds, times the square of the time [s^2]: a displacement by
-accelerations grows with that square, the bend does not. On a real drone's starts the scale is 13 % off after 1.2 s, 20 %
-after 1.8 s, 6 % after 2.5 s, half of which readings and residuals explain."""
+accelerations grows with that square, the bend does not. On a real drone's starts the scale is off by 13 % after 1.2 s,
+20 % after 1.8 s, 6 % after 2.5 s, half of which readings and residuals explain."""
 IMU_AXES_RAD = 0.01
 """Error of gravity's direction by the accelerometer's axes, likewise: 0.4 degrees on that flight; data sheets allow
 axes that are 0.3 (ADIS16448) to 1 degree (MPU-6050) from square."""

@@ -15,8 +15,7 @@ from edgeslam_torch.types import ScaleEstimate
 _BELIEVED = 0.3
 """Maximum relative sigma of a scale from telemetry."""
 _SURE = 0.15
-"""Relative sigma, that of the best depth networks, up to which velocities constrain a map whose scale is from heights
-alone (one that is wrong by several times would distort it), and above which a network adds to an IMU."""
+"""Relative sigma of the best depth networks, above which one adds to an IMU."""
 _FOCAL_SHARE = 0.4
 """Share of a focal length's relative error that the scale from telemetry inherits; set on recordings with focal lengths
 of 0.7 to 1.5 times the true one."""
@@ -147,10 +146,10 @@ class ScaleEstimator:
         return replace(belief, sigma=math.hypot(belief.sigma, share * self._focal_sigma))
 
     def velocity_constrains_map(self, trust: SensorGate) -> bool:
-        """Whether velocities may constrain the map: not with an inaccurate scale from heights alone."""
+        """Whether velocities may constrain the map: only at a scale that they determine themselves. In another unit
+        they would stretch a map whose scale is by heights."""
         measured = self.sensor_scale
-        sure = measured is not None and ("telemetry" in measured.source or measured.sigma < _SURE)
-        return sure and trust.velocity and "telemetry" not in self.decided.rejected
+        return measured is not None and "telemetry" in measured.source and trust.velocity
 
     def sources(self) -> tuple[ScaleEstimate, ...]:
         """Scale by each source alone, used or not; without sensors that others have outvoted."""

@@ -79,7 +79,7 @@ def motion_factors(
             share = GUESSED if model.holds_level else attitude
             gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(share)))
         heading = model.headings(stamps)
-        if heading is not None:
+        if heading is not None and heading.passes(np.stack([keyframes[i].T_c_w[:3, :3] for i in order[heading.frame]])):
             poses = order[heading.frame]
             turned.append(HeadingFactor(poses, heading.R_c_m, heading.up_m, attitude * heading.information))
     return MotionFactors(tuple(centres), tuple(gravity), tuple(turned))

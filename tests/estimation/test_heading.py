@@ -17,11 +17,11 @@ from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
 T_B_C = camera_on_body()
 
 
-def flown(rng, motion, keep=lambda sample: True, turn=0.0, **changes):
+def flown(rng, motion, keep=lambda sample: True, turn=0.0, spoil=lambda sample: sample, **changes):
     """Headings of some frames, and their true rotations, in a map that is turned about the vertical."""
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()
     track = TelemetryTrack("world", 0.35)
-    track.add([sample for sample in samples if keep(sample)])
+    track.add([spoil(sample) for sample in samples if keep(sample)])
     R_m_w = Rotation.from_euler("z", turn).as_matrix()
     chosen = np.arange(20, len(motion.stamps_s) - 20, 15)
     model = TelemetryModel(track, FusionConfig(), T_B_C, R_m_w.T, 0.0, 0.0, 1.0, 0.02, True, None, truncates=0.0)
@@ -82,3 +82,17 @@ def test_nothing_is_told_without_attitude_or_metres_or_in_a_hole(rng, swinging):
     told, true, stamps_s = flown(rng, motion, keep=lambda sample: not 4.0 < sample.stamp_s < 8.0)
     missing = (stamps_s > 4.1) & (stamps_s < 7.9)
     assert missing.any() and not np.isin(np.flatnonzero(missing), told.frame).any()
+
+
+def test_headings_after_a_jump_of_yaw_do_not_pass(rng, swinging):
+    """A map that turns by five degrees on the way is one that headings are to correct."""
+
+    def jumps(sample):
+        return replace(sample, rpy_rad=sample.rpy_rad + [0.0, 0.0, math.radians(30.0) * (sample.stamp_s > 7.0)])
+
+    told, true, _ = flown(rng, swinging(14.0), turn=2.0)
+    bend = Rotation.from_euler("z", np.radians(np.linspace(0.0, 5.0, len(told.frame)))[:, None]).as_matrix()
+    assert told.passes(true[told.frame])
+    assert told.passes(true[told.frame] @ bend)
+    told, true, _ = flown(rng, swinging(14.0), turn=2.0, spoil=jumps)
+    assert not told.passes(true[told.frame])

@@ -27,7 +27,7 @@ def test_revision_leaves_the_present_camera_where_it_is(rng):
     ("value", "sigma", "source"),
     [
         (3.0, 0.1, "depth"),  # the network guessed already, and has nothing new to say
-        (3.0, 0.46, "telemetry"),  # no surer than a network
+        (3.0, 1.4, "telemetry"),  # hardly known, and within that
         (2.02, 0.05, "height+depth"),  # within its own uncertainty
         (1.0, np.inf, "none"),
     ],

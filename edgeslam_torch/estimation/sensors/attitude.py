@@ -13,10 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
+from edgeslam_torch.gate import passes
+from edgeslam_torch.geometry.rotations import vectors_from_matrices
 from edgeslam_torch.noise import (
     DELAY_S,
     HEADING_DRIFT_RAD_S,
     HEADING_RAD,
+    MAP_TURN_RAD,
     TURN_SHARE,
     UP_MEMORY_S,
     UP_RAD,
@@ -59,6 +62,13 @@ class Headings:
     """``(3,)`` the vertical in the map."""
     information: FloatArray
     """``(U, U)`` of the heading errors [1/rad^2]; a common rotation is not determined."""
+
+    def passes(self, R_c_m: FloatArray) -> bool:
+        """Whether they agree with the frames' rotations ``(U, 3, 3)`` in a map that may be bent; not across a jump of
+        yaw."""
+        apart = np.swapaxes(self.R_c_m, 1, 2) @ R_c_m
+        residual = vectors_from_matrices(apart[0].T @ apart) @ self.up_m
+        return passes(residual, np.linalg.inv(self.information) + MAP_TURN_RAD**2 * np.eye(len(residual)))
 
 
 def up_directions(
