@@ -71,10 +71,10 @@ IMU_BIAS_SIGMA = np.repeat([0.1, 0.3], 3)
 IMU_SCALE_LOG = 0.01
 """Error of the scale by the accelerometer's gain and axes, which averaging does not reduce: a percent beside the laser
 tracker of a real flight; data sheets allow 3 % (MPU-6050)."""
-IMU_YOUNG_LOG_S2 = 0.4
-"""Error of the scale by a map that bends in its first seconds, times the square of the time [s^2]: a displacement by
-accelerations grows with that square, the bend does not. On a real drone's starts the scale is off by 13 % after 1.2 s,
-20 % after 1.8 s, 6 % after 2.5 s, half of which readings and residuals explain."""
+IMU_YOUNG_LOG, IMU_YOUNG_S = 0.2, 2.0
+"""Error of the scale by a map that bends in its first seconds, and the time after which it falls with the square of the
+time, as displacements by accelerations grow. On a real drone's starts the scale is off by 20 % in the first second, 13
+to 20 % in the next, 6 % after 2.5 s; readings and residuals explain half of it."""
 IMU_AXES_RAD = 0.01
 """Error of gravity's direction by the accelerometer's axes, likewise: 0.4 degrees on that flight; data sheets allow
 axes that are 0.3 (ADIS16448) to 1 degree (MPU-6050) from square."""

@@ -28,7 +28,8 @@ from edgeslam_torch.noise import (
     IMU_AXES_RAD,
     IMU_BIAS_SIGMA,
     IMU_SCALE_LOG,
-    IMU_YOUNG_LOG_S2,
+    IMU_YOUNG_LOG,
+    IMU_YOUNG_S,
     KNOWN_LEVER_M,
     KNOWN_MOUNT_RAD,
     KNOWN_OFFSET_S,
@@ -92,7 +93,8 @@ class Alignment:
     @property
     def sigma_log_scale(self) -> float:
         """Standard deviation of the log scale."""
-        systematic = math.hypot(IMU_SCALE_LOG, IMU_YOUNG_LOG_S2 / (self.stamps_s[-1] - self.stamps_s[0]) ** 2)
+        young = IMU_YOUNG_LOG / (1.0 + ((self.stamps_s[-1] - self.stamps_s[0]) / IMU_YOUNG_S) ** 2)
+        systematic = math.hypot(IMU_SCALE_LOG, young)
         return math.hypot(math.sqrt(self.covariance[_SCALE, _SCALE]), systematic)
 
     @property
