@@ -56,12 +56,12 @@ def test_sequence_is_within_its_bar(data_dir, tmp_path, name):
             "pitch_mirrored/euroc_mh05_a",
             0.036,
         ),  # images alone: .018 to .033 m; a map held to it: .05 to .26
-        ("centimetres/euroc_mh05_a", 0.036),  # a map that velocities of another unit stretch: .39 to 2.1
-        ("yaw_jumping/tartan_hospital", 0.15),  # images alone: .05 to .14; a map turned at the jump: .22 to .83
+        ("centimetres/euroc_mh05_a", 0, 0.036),  # a map that velocities of another unit stretch: .39 to 2.1
+        ("yaw_jumping/tartan_hospital", 0, 0.15),  # images alone: .05 to .14; a map turned at the jump: .22
     ],
 )
-def test_telemetry_that_is_wrong_does_not_bend_the_map(data_dir, tmp_path, fault, ate_m):
-    (cell,) = list_cells(data_dir, "all", [1], [f"telemetry/{fault}"])
+def test_telemetry_that_is_wrong_does_not_bend_the_map(data_dir, tmp_path, fault, seed, ate_m):
+    (cell,) = list_cells(data_dir, "all", [seed], [f"telemetry/{fault}"])
     arguments = {"cell": cell.to_dict(), "overrides": [], "max_frames": None, "flights": str(tmp_path)}
     assert run_cell(arguments, tmp_path / "out")["figures"]["ate_m"] < ate_m
 
