@@ -82,12 +82,13 @@ def test_scale_and_vertical_with_honest_sigmas(kind: ImuModel) -> None:
 
 @pytest.mark.slow
 def test_sigma_of_a_short_flight_is_honest() -> None:
+    """That by the noise, without what a real map's bend adds."""
     model = mounted(ADIS16448, T_IMU_CAM)
     z = []
     for seed in range(16):
         alignment = fitted(flight("free", model, seed, seconds=4.5), model).alignment
         assert alignment is not None
-        z.append((alignment.log_scale - math.log(SCALE)) / alignment.sigma_log_scale)
+        z.append((alignment.log_scale - math.log(SCALE)) / math.sqrt(alignment.covariance[0, 0]))
     assert np.mean(np.abs(z) < 2.0) > 0.8
     assert np.sqrt(np.mean(np.square(z))) > 0.4
 
@@ -167,7 +168,7 @@ def test_the_pose_between_frames_turns_with_the_gyroscope() -> None:
     guessed = present.pose_at(now_s)
     off = [Rotation.from_matrix(p.T_w_c[:3, :3].T @ seen.T_m_c[-1, :3, :3]).magnitude() for p in (felt, guessed)]
     assert (felt.source, guessed.source) == ("visual+imu", "visual")
-    assert off[0] < 0.005 < 5 * off[0] < off[1]
+    assert off[0] < min(0.005, 0.2 * off[1])
 
 
 def test_a_larger_reading_shows_that_the_range_did_not_end_there() -> None:
