@@ -6,6 +6,7 @@ import socket
 import threading
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -303,6 +304,20 @@ def test_listeners_that_fail_do_not_end_state_or_video(caplog):
 )  # fmt: skip
 def test_late_answers_and_noise_are_not_taken_for_an_answer(command, text, belongs):
     assert belongs_to(command, text) is belongs
+
+
+@pytest.mark.parametrize(
+    ("fields", "level"),
+    [
+        ({"tof": 120.0, "h": 30.0}, 120.0),
+        ({"tof": 6553.0, "h": 30.0}, 30.0),  # nothing in range
+        ({"tof": 0.0, "h": 30.0}, 30.0),
+        ({"tof": "12cm", "h": 30.0}, 30.0),
+        ({"h": "x"}, None),
+    ],
+)
+def test_the_level_is_the_range_sensors_where_it_measures_one(fields, level):
+    assert Tello._level(SimpleNamespace(_fresh=lambda: fields)) == level
 
 
 def test_no_answer_is_an_error_with_a_remedy():
