@@ -118,7 +118,7 @@ class MotionFusion:
         if self.imu.is_due(stamp_s):
             self._remember_refined(stamp_s, IMU_REACH_S)
             self._fit_imu()
-        if self._trust.velocity and self._trust.motion:
+        if self._trust.motion and self.metres.uses_velocity(self._trust):
             self._filter.see(visual, self.scale(), self.flight.delay.delay)
         else:
             self._filter.clear()
@@ -307,7 +307,7 @@ class MotionFusion:
             self.flight.delay_sigma_s,
             1.0 if scale is None else math.exp(scale.log_scale),
             math.inf if scale is None else scale.sigma,
-            self.metres.velocity_constrains_map(self._trust),
+            self.metres.uses_velocity(self._trust),
             heights[0] if scale is not None and heights and "height" not in self.metres.decided.rejected else None,
             self.metres.fit.truncates,
             self._trust.attitude,

@@ -145,9 +145,9 @@ class ScaleEstimator:
         """With a share of the focal length's error, which is common to all that a source measures."""
         return replace(belief, sigma=math.hypot(belief.sigma, share * self._focal_sigma))
 
-    def velocity_constrains_map(self, trust: SensorGate) -> bool:
-        """Whether velocities may constrain the map: only at a scale that they determine themselves. In another unit
-        they would stretch a map whose scale is by heights."""
+    def uses_velocity(self, trust: SensorGate) -> bool:
+        """Whether velocities may constrain the map and predict poses: only at a scale that they determine themselves.
+        Those in another unit would stretch the map, or lead away from it."""
         measured = self.sensor_scale
         return measured is not None and "telemetry" in measured.source and trust.velocity
 
