@@ -23,6 +23,8 @@ VELOCITY_SCALE_LOG = 0.008
 """Systematic scale error of the drone's velocity, which averaging does not reduce."""
 VELOCITY_TRUNCATED_SCALE_LOG = 0.015
 """The same when readings are truncated: the mean remainder depends on an assumed noise."""
+PATH_RATIO_LOG = 0.25
+"""Of the length of a path by velocities over that by vision: on a slow take-off half of it is quantisation."""
 
 # --- attitude ---------------------------------------------------------------------------------------------------------
 

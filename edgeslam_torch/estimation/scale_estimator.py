@@ -5,17 +5,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from edgeslam_torch.estimation.config import FusionConfig
-from edgeslam_torch.estimation.scale.belief import Decision, ScaleBelief, decide, mean
+from edgeslam_torch.estimation.scale.belief import Decision, ScaleBelief, contradict, decide, mean
 from edgeslam_torch.estimation.scale.depth_scale import DepthRatio, DepthRatios
 from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, SensorGate
 from edgeslam_torch.estimation.telemetry_scale import TelemetryFit
-from edgeslam_torch.noise import DEPTH_SCALE_LOG
+from edgeslam_torch.noise import DEPTH_SCALE_LOG, PATH_RATIO_LOG
 from edgeslam_torch.types import ScaleEstimate
 
 _BELIEVED = 0.3
 """Maximum relative sigma of a scale from telemetry."""
 _SURE = 0.15
-"""Relative sigma of the best depth networks, above which one adds to an IMU."""
+"""Relative sigma of the best depth networks: an IMU that is less sure is used along with one, and heights alone say
+nothing of velocities."""
 _FOCAL_SHARE = 0.4
 """Share of a focal length's relative error that the scale from telemetry inherits; set on recordings with focal lengths
 of 0.7 to 1.5 times the true one."""
@@ -146,10 +147,15 @@ class ScaleEstimator:
         return replace(belief, sigma=math.hypot(belief.sigma, share * self._focal_sigma))
 
     def uses_velocity(self, trust: SensorGate) -> bool:
-        """Whether velocities may constrain the map and predict poses: only at a scale that they determine themselves.
-        Those in another unit would stretch the map, or lead away from it."""
-        measured = self.sensor_scale
-        return measured is not None and "telemetry" in measured.source and trust.velocity
+        """Whether velocities may constrain the map and predict poses: at a scale that they determine, or that heights
+        do and the length of their path does not contradict. Those in another unit would stretch the map."""
+        measured, ratio = self.sensor_scale, self.fit.path_ratio
+        if measured is None or not trust.velocity:
+            return False
+        if "telemetry" in measured.source:
+            return True
+        by_path = None if ratio is None else ScaleBelief(math.log(ratio), PATH_RATIO_LOG, "telemetry")
+        return measured.sigma < _SURE and by_path is not None and not contradict(measured, by_path)
 
     def sources(self) -> tuple[ScaleEstimate, ...]:
         """Scale by each source alone, used or not; without sensors that others have outvoted."""

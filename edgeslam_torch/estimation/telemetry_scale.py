@@ -83,6 +83,8 @@ class TelemetryFit:
     is hardly known. It matters where the path is hardly longer than the noise."""
     truncates: float = 0.5
     """Probability that velocities are truncated, not rounded."""
+    path_ratio: float | None = None
+    """Length of the path by velocities over that by vision: metres per map unit, roughly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +191,8 @@ class TelemetryScale:
             rms = moved[max(velocity, key=lambda r: weight[r])].rms_m
         truncates = weight.get(Rounding.TRUNCATE, 0.0)
         shortfall_m_s = 0.5 * config.velocity_step_m_s if truncates > 0.5 else 0.0
-        fit = TelemetryFit(rms, shortfall_m_s, noise_log, truncates) if found else None
+        path_ratio = None if self._shown is None else self._shown.start
+        fit = TelemetryFit(rms, shortfall_m_s, noise_log, truncates, path_ratio) if found else None
         return None if few and not found else found, fit
 
     def _by_velocity(self, rounding: Rounding, moved: Evidence) -> ScaleBelief | None:

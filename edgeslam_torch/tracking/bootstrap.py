@@ -167,14 +167,14 @@ class Bootstrap:
         awaited = min(least, np.deg2rad(LAST_CHANCE_DEG)) if leaving else least
         angle = self._rotation_residual(view, reference_keypoint, keypoint)
         if angle < awaited:
-            return TwoView("pure rotation", angle)
+            return TwoView("no parallax yet", angle)
         p_r = camera.back_project(reference.features.uv[reference_keypoint], self.guess_depth[reference_keypoint])
         guess = Structure(track.T_c_w, reference_keypoint, keypoint, se3.transform(reference.T_w_c, p_r))
         best = self._most_probable(view, guess)
         structure = best.structure
         angle = self._rotation_residual(view, structure.reference_keypoint, structure.keypoint)  # without outliers
         if angle < awaited:
-            return TwoView("pure rotation", angle)
+            return TwoView("no parallax yet", angle)
         if best.direction_sigma > (MAX_DIRECTION_SIGMA_ALONE if self._alone else self.config.max_direction_sigma):
             return TwoView("rotation and translation are not yet distinguishable", angle)
         structure = at_scale_of(reference, structure, self.guess_depth[structure.reference_keypoint])

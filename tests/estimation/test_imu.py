@@ -12,7 +12,7 @@ from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.estimation.sensors.imu import Imu
 from edgeslam_torch.estimation.snapshot import Present
 from edgeslam_torch.imu import ImuModel, ImuReadings
-from edgeslam_torch.noise import VISUAL_MEMORY_S
+from edgeslam_torch.noise import IMU_YOUNG_S, VISUAL_MEMORY_S
 from edgeslam_torch.synthetic.flights.imu import ADIS16448, MPU6050, mounted, simulate_imu
 
 SCALE = 0.4
@@ -91,6 +91,36 @@ def test_sigma_of_a_short_flight_is_honest() -> None:
         z.append((alignment.log_scale - math.log(SCALE)) / math.sqrt(alignment.covariance[0, 0]))
     assert np.mean(np.abs(z) < 2.0) > 0.8
     assert np.sqrt(np.mean(np.square(z))) > 0.4
+
+
+@pytest.mark.parametrize("seconds", [2.4, 3.2])
+def test_the_scale_of_the_first_seconds_is_rough_and_says_so(seconds: float) -> None:
+    """1.2 and 2 s of poses, in which a real map bends by a fifth."""
+    model = mounted(ADIS16448, T_IMU_CAM)
+    for seed in range(4):
+        seen = flight("free", model, seed, seconds)
+        bend = np.exp(np.linspace(-0.15, 0.15, len(seen.T_m_c)))
+        seen.T_m_c[1:, :3, 3] = seen.T_m_c[0, :3, 3] + np.cumsum(
+            np.diff(seen.T_m_c[:, :3, 3], axis=0) * bend[1:, None], axis=0
+        )
+        found = fitted(seen, model).scale
+        if found is not None:
+            assert found.sigma > 0.05
+            assert abs(found.log_scale - math.log(SCALE)) < 2.5 * found.sigma
+
+
+def test_a_map_that_bends_in_its_first_seconds_bends_no_scale() -> None:
+    model, off = mounted(ADIS16448, T_IMU_CAM), []
+    for seed in range(3):
+        seen = flight("free", model, seed)
+        step = np.diff(seen.T_m_c[:, :3, 3], axis=0)
+        step[seen.stamps_s[1:] - seen.stamps_s[0] < IMU_YOUNG_S] *= math.exp(0.3)
+        seen.T_m_c[1:, :3, 3] = seen.T_m_c[0, :3, 3] + np.cumsum(step, axis=0)
+        found = fitted(seen, model).scale
+        assert found is not None
+        off.append(found.log_scale - math.log(SCALE))
+    assert np.median(np.abs(off)) < 0.005
+    assert np.max(np.abs(off)) < 0.015
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=["ADIS16448", "MPU-6050"])

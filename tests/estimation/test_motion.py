@@ -240,6 +240,25 @@ def test_a_scale_is_held_in_hover_unless_it_is_from_heights_alone(sources, held,
     assert (metres.sensor_scale is not None) == (held and found is None)
 
 
+@pytest.mark.parametrize(
+    ("source", "sigma", "path_ratio", "used"),
+    [
+        ("telemetry", 0.25, 100.0, True),
+        ("height", 0.1, 1.3, True),
+        ("height", 0.1, None, False),
+        ("height", 0.25, 1.3, False),
+        ("height", 0.1, 3.28, False),  # in feet
+        ("height", 0.1, 0.1, False),
+    ],
+)
+def test_velocities_are_used_only_at_a_scale_that_they_agree_with(source, sigma, path_ratio, used):
+    trusting = SimpleNamespace(velocity=True, tells_scale=True, height=lambda reading: True)
+    metres = ScaleEstimator(FusionConfig(), 0.0)
+    metres.take({source: ScaleBelief(0.0, sigma, source)}, TelemetryFit(path_ratio=path_ratio), trusting)
+    assert metres.uses_velocity(trusting) == used
+    assert not metres.uses_velocity(SimpleNamespace(velocity=False))
+
+
 # --- the depth network and an earlier flight ----------------------------------------------------------------------
 
 

@@ -102,7 +102,7 @@ def test_pure_rotation_is_rejected_with_a_reason(points):
     track = bootstrap.track(view, turn @ points.world.T_c_w[0])
     found = bootstrap.two_views(1, view, track, leaving=True)
     assert found.structure is None
-    assert found.reason == "pure rotation"
+    assert found.reason == "no parallax yet"
 
 
 def test_few_matches_are_rejected_with_a_reason(points):

@@ -205,7 +205,7 @@ def _plan(args: argparse.Namespace, limits: "NavLimits") -> list[str]:
     return [
         "plan:",
         *lines,
-        f"limits: {limits.speed_m_s:g} m/s, heights {limits.lowest_m:g} to {limits.highest_m:g} m, "
+        f"limits: {limits.speed_m_s:g} m/s on average, heights {limits.lowest_m:g} to {limits.highest_m:g} m, "
         f"{limits.fence_m:g} m from the take-off, home at {100 * limits.home_battery:.0f} % battery; "
         "only through observed free space",
     ]

@@ -21,6 +21,8 @@ import numpy as np
 from edgeslam_torch.gate import passes
 from edgeslam_torch.types import ScaleEstimate
 
+MOST_SIGMA = 0.5
+"""Relative sigma above which a scale counts as unknown."""
 _CONFIDENCE = 0.997
 """Share of pairs of correct estimates that pass: three sigmas."""
 _GROSS_LOG = math.log(1.5)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgeslam_torch.estimation.scale.belief import ScaleBelief
+from edgeslam_torch.estimation.scale.belief import MOST_SIGMA, ScaleBelief
 from edgeslam_torch.geometry.robust_statistics import RMS_MEDIAN_3DOF, median, robust_sigma, tukey_weight
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.noise import (
@@ -30,8 +30,6 @@ from edgeslam_torch.noise import (
 )
 from edgeslam_torch.types import FloatArray, IntArray
 
-_MOST_SIGMA = 0.5
-"""Relative sigma above which evidence is discarded."""
 _LEAST_WEIGHT = 1e-3
 _MIN_EXPLAINED = 0.5
 """Minimum share of the visual path explained by the fit."""
@@ -99,7 +97,7 @@ class Evidence:
         """The scale with a relative systematic error added; None where it is hardly determined."""
         rough = self.solved(tilt_sigma_rad)
         found = None if rough is None else self.softened(systematic * rough[0]).solved(tilt_sigma_rad)
-        if found is None or found[1] >= _MOST_SIGMA:
+        if found is None or found[1] >= MOST_SIGMA:
             return None
         return ScaleBelief(math.log(found[0]), found[1], source)
 

@@ -8,15 +8,13 @@ import numpy as np
 
 from edgeslam_torch.estimation.inertial.alignment import Alignment, align
 from edgeslam_torch.estimation.inertial.preintegration import HELD_S, preintegrate
-from edgeslam_torch.estimation.scale.belief import ScaleBelief
+from edgeslam_torch.estimation.scale.belief import MOST_SIGMA, ScaleBelief
 from edgeslam_torch.geometry.gyroscope_check import checked_against_rotation
 from edgeslam_torch.geometry.rotations import fitted_rotation, smallest_rotation, vectors_from_matrices
 from edgeslam_torch.imu import ImuModel, ImuReadings
 from edgeslam_torch.noise import IMU_YOUNG_S
 from edgeslam_torch.types import FloatArray
 
-KNOWN_LOG = 0.5
-"""Maximum standard deviation of the log of an observable scale."""
 _LEAST_EXCITATION = 3.0
 """Minimum of `Alignment.excitation` of an observable scale."""
 _NODE_S = 0.09
@@ -25,8 +23,8 @@ REACH_S = 60.0
 """Length of way that a fit in flight takes: a map's scale drifts over longer ones."""
 _REFIT_S, _REFIT_SHARE = 0.2, 0.12
 """Time between fits, and as a share of the time so far: later fits cost more and change less."""
-_YOUNG_PARTS = 5.0
-"""Length of a way that is fitted without its first seconds, in which the map bends, in these."""
+_MATURE_S = 10.0
+"""Length of a way from which on the fit leaves out the map's first `IMU_YOUNG_S`, in which it bends."""
 _CONTRADICTED_RAD = math.radians(3.0)
 """Size of the errors of visual rotations beyond which gyroscope and images do not move together; in flight they are
 0.1 to 0.3 degrees."""
@@ -101,7 +99,7 @@ class Imu:
         margin_s = _OFFSET_RANGE_S if self._mount is None else abs(self._mount[1])
         first_s = max(self._since_s, stamps_s[-1] - reach_s, self._parts[0].stamps_s[0] + margin_s)
         began_s = max(self._since_s, float(stamps_s[0]))
-        if stamps_s[-1] - began_s > _YOUNG_PARTS * IMU_YOUNG_S:
+        if stamps_s[-1] - began_s > _MATURE_S:
             first_s = max(first_s, began_s + IMU_YOUNG_S)
         last_s = self._parts[-1].stamps_s[-1] - margin_s
         used = (stamps_s > first_s) & (stamps_s <= last_s + HELD_S)
@@ -138,7 +136,7 @@ class Imu:
     def scale(self) -> ScaleBelief | None:
         """Metres per map unit; None while it is not observable."""
         found = self.alignment
-        if found is None or found.excitation < _LEAST_EXCITATION or not found.sigma_log_scale < KNOWN_LOG:
+        if found is None or found.excitation < _LEAST_EXCITATION or not found.sigma_log_scale < MOST_SIGMA:
             return None
         return ScaleBelief(found.log_scale, found.sigma_log_scale, "imu")
 
