@@ -24,6 +24,7 @@ from edgeslam_torch.estimation.sensors.height import heights
 from edgeslam_torch.estimation.sensors.rows import Rows, stacked
 from edgeslam_torch.estimation.sensors.velocity import displacements
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
+from edgeslam_torch.gate import consistent
 from edgeslam_torch.geometry.robust_statistics import tukey_weight
 from edgeslam_torch.types import FloatArray
 
@@ -133,22 +134,22 @@ class TelemetryModel:
         return displacements(self.track, at_s, per_scale_w, p_w, gain, arm_b, step, self.truncates, self.delay_sigma_s)
 
     def _gaussian(self, rows: Rows, p_m: FloatArray) -> PositionGaussian:
-        """Marginalise, reweight outliers, and rotate to map axes."""
+        """Marginalise what does not contradict the map, with robust weights of its independent errors, and rotate to
+        map axes."""
         D = np.einsum("mkw,wv->mkv", rows.D, self.R_w_m).reshape(len(rows.measured), -1) * self.scale
         residual = D @ p_m.ravel() - rows.measured
         slow = rows.slow + rows.common @ rows.common.T
-        weight = np.ones(len(residual))
+        allowed = rows.white + np.square(_BENT * np.minimum(rows.way, np.median(rows.way)))
+        used = np.flatnonzero(consistent(residual, slow + np.diag(allowed), rows.group))
+        D, residual, measured, slow = D[used], residual[used], rows.measured[used], slow[np.ix_(used, used)]
+        white, group = rows.white[used], np.unique(rows.group[used], return_inverse=True)[1]
+        weight = np.ones(len(used))
         for _ in range(3):
-            clean = residual - slow @ np.linalg.solve(slow + np.diag(rows.white / weight), residual)
-            allowed = rows.white + np.square(_BENT * np.minimum(rows.way, np.median(rows.way)))
-            power = np.bincount(rows.group, clean**2 / allowed)
-            z = np.sqrt(power)
-            spread = max(1.0, float(np.median(z)))
-            tukey = tukey_weight(z, spread)
-            weight = np.maximum(tukey, _LEAST_WEIGHT)[rows.group]
-        whitened = np.linalg.solve(slow + np.diag(rows.white / weight), np.column_stack([D, rows.measured]))
-        A = D.T @ whitened[:, :-1]
-        refused = int(np.count_nonzero(tukey <= _LEAST_WEIGHT))
+            clean = residual - slow @ np.linalg.solve(slow + np.diag(white / weight), residual)
+            tukey = tukey_weight(np.sqrt(np.bincount(group, clean**2 / allowed[used])), 1.0)
+            weight = np.maximum(tukey, _LEAST_WEIGHT)[group]
+        whitened = np.linalg.solve(slow + np.diag(white / weight), np.column_stack([D, measured]))
+        A, count = D.T @ whitened[:, :-1], len(np.unique(rows.group))
         return PositionGaussian(
-            0.5 * (A + A.T), D.T @ whitened[:, -1], float(rows.measured @ whitened[:, -1]), len(tukey), refused
+            0.5 * (A + A.T), D.T @ whitened[:, -1], float(measured @ whitened[:, -1]), count, count - len(tukey)
         )

@@ -74,7 +74,7 @@ def test_right_positions_cost_next_to_nothing_and_wrong_ones_are_mended(rng, swi
     model, stamps, p = flown(rng, swinging(12.0), height=height, scale_sigma_log=0.02)
     right = model.positions(stamps, p)
     assert chi2(right, p) < 0.02 * right.rows
-    disturbed = p + rng.normal(0.0, 0.03, p.shape)
+    disturbed = p + rng.normal(0.0, 0.01, p.shape)
     told = model.positions(stamps, disturbed)
     assert chi2(told, disturbed) > 10.0 * chi2(told, p)
     short = np.diff(best(told, disturbed), axis=0) - np.diff(p, axis=0)
@@ -124,6 +124,22 @@ def test_wild_readings_are_refused(rng, swinging):
     told = model_of(samples).positions(stamps, p)
     assert 1 <= told.refused <= 2
     assert chi2(told, p) < 0.2 * told.rows
+
+
+@pytest.mark.parametrize("height", [None, "tof"])
+def test_velocities_that_jump_bend_no_map(rng, swinging, height):
+    """One metre a second too much from the middle on: the map's own shape stays, and the first half is used."""
+    motion = swinging(12.0)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()
+    wrong = [replace(s, velocity_m_s=s.velocity_m_s + [s.stamp_s > 6.0, 0.0, 0.0]) for s in samples]
+    _, stamps, p = flown(rng, motion)
+    told = replace(model_of(wrong), height=height).positions(stamps, p)
+    late = np.sum(stamps > 6.5)
+    assert late - 2 <= told.refused <= late + 2
+    assert chi2(told, p) < 0.1 * told.rows
+    early = stamps < 5.5
+    stretched = p + np.where(early, 0.3, 0.0)[:, None] * (p - p[0])
+    assert chi2(told, stretched) > 10.0 * told.rows
 
 
 def test_an_outage_leaves_the_positions_across_it_alone(rng, swinging):
