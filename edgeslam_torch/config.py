@@ -129,9 +129,9 @@ class InitialisationConfig:
 class MappingConfig:
     """Stage 3: keyframes and anchors."""
 
-    keyframe_min_gap_s: float = 0.15
+    keyframe_min_gap_s: float = 0.14
     """Minimum time between keyframes: a camera moved by hand or in slow flight has then gained about a degree of
-    parallax."""
+    parallax. Between the frames of videos at 10, 20 and 30 Hz, so that no rounding of stamps decides."""
     keyframe_max_gap_s: float = 0.98
     """Maximum time between keyframes while the camera moves: a second, less half a frame at 30 Hz for rounding."""
     keyframe_parallax_deg: float = 3.0
