@@ -26,7 +26,14 @@ from edgeslam_torch.tracking.flow import (
     template_of_track,
     with_followed,
 )
-from edgeslam_torch.tracking.keyframe_choice import KNOWN_SHARE, due_by_flow, few_matches, is_due, known_share
+from edgeslam_torch.tracking.keyframe_choice import (
+    KNOWN_SHARE,
+    due_by_flow,
+    few_matches,
+    is_due,
+    known_share,
+    lost_most,
+)
 from edgeslam_torch.tracking.lazy_view import LazyView
 from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, candidates
 from edgeslam_torch.tracking.tracker import Track, View, make_view, parallax_to
@@ -198,18 +205,28 @@ class Tracking:
             view = seen.view
         with self.system.timed("tracking"):
             track, relocalised = self._find(frame, view, T_predicted, followed, strong)
-        return None if track is None else self._located(track, view, seen, frame.stamp_s, strong, relocalised)
+        if track is None:
+            return None
+        at_once = followed is not None and lost_most(followed)
+        return self._located(track, view, seen, frame.stamp_s, strong, relocalised, at_once)
 
     def _located(
-        self, track: Track, view: View, seen: LazyView, stamp_s: float, due: bool, relocalised: bool
+        self,
+        track: Track,
+        view: View,
+        seen: LazyView,
+        stamp_s: float,
+        due: bool,
+        relocalised: bool,
+        at_once: bool = False,
     ) -> Located:
-        """The pose of a matched frame, which becomes the template for the next ones."""
+        """The pose of a matched frame, which becomes the template for the next ones; ``at_once`` as in `is_due`."""
         system = self.system
         reference = system.tracker.local_keyframes(track.anchor)[0]
         parallax_rad = parallax_to(reference, track, system.map.anchors.p_w)
         few = few_matches(track, reference, system.map)
         since_s = stamp_s - system.keyframe_s
-        due = due or is_due(few, parallax_rad, since_s, system.config.mapping)
+        due = due or is_due(few, parallax_rad, since_s, system.config.mapping, at_once)
         self._template = template_of_track(track, view, reference, seen.grey)
         uv, inv_sigma = view.features.uv[track.keypoint], view.inv_sigma[track.keypoint]
         return Located(track, reference, parallax_rad, due, uv, inv_sigma, view, relocalised)
