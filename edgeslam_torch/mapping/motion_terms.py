@@ -9,6 +9,7 @@ import numpy as np
 from edgeslam_torch.estimation.acceleration_prior import inertia
 from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.noise import ATTITUDE_RAD
 from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
 
 EFFECTIVE_SAMPLES = 120.0
@@ -77,7 +78,8 @@ def motion_factors(
         up, attitude = model.up(stamps), max(1.0, ATTITUDE * effective_samples)
         if up is not None:
             share = GUESSED if model.holds_level else attitude
-            gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(share)))
+            sigma_rad = max(up.sigma_rad / math.sqrt(share), ATTITUDE_RAD)
+            gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, sigma_rad))
         heading = model.headings(stamps)
         if heading is not None and heading.passes(np.stack([keyframes[i].T_c_w[:3, :3] for i in order[heading.frame]])):
             poses = order[heading.frame]
