@@ -307,13 +307,13 @@ def test_gravity_has_the_weight_of_other_telemetry(rng, halves):
 
 
 def test_gravity_dominates_in_a_new_map_without_metric_scale(rng, halves):
-    """Then depths are guesses: a third of a degree is worth less than the attitude of a drone, and not after that."""
+    """Then depths are guesses: two thirds of a degree are worth less than the attitude of a drone, and not after that."""
     model = telemetry_of(rng, halves)
     (before,), (after,) = (
         motion_factors(m, halves.keyframes, [0] * 6).gravity
         for m in (replace(model, scale_sigma_log=np.inf, velocity=False, new_map=True), model)
     )
-    assert np.degrees(before.sigma_rad) < 0.2 < 0.5 < np.degrees(after.sigma_rad)
+    assert np.degrees(before.sigma_rad) < 0.4 < 0.5 < np.degrees(after.sigma_rad)
 
 
 def test_a_whole_map_may_use_the_full_weight_of_telemetry(rng, halves):
