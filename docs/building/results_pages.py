@@ -226,6 +226,8 @@ def _ablated(rows: dict[str, list[dict[str, Any]]], name: str) -> tuple[list[str
 def _ablated_run(runs: Sequence[Figures]) -> str:
     """Median errors of a cell's trajectory and map."""
     ate, surface = ([f[key] for f in runs if f.get(key) is not None] for key in ("ate_sim3_m", "map_median_m"))
+    if not ate:
+        return "no trajectory"
     return f"{median(ate):.4f}" + (f"; {100 * median(surface):.1f}" if surface else "")
 
 

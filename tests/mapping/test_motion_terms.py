@@ -307,7 +307,7 @@ def test_gravity_has_the_weight_of_other_telemetry(rng, halves):
 
 
 def test_gravity_dominates_in_a_new_map_without_metric_scale(rng, halves):
-    """Then depths are guesses: two thirds of a degree are worth less than the attitude of a drone, and not after that."""
+    """Then depths are guesses, and a drone's attitude has the error of its quantisation; not after that."""
     model = telemetry_of(rng, halves)
     (before,), (after,) = (
         motion_factors(m, halves.keyframes, [0] * 6).gravity
