@@ -142,6 +142,15 @@ def test_velocities_that_jump_bend_no_map(rng, swinging, height):
     assert chi2(told, stretched) > 10.0 * told.rows
 
 
+def test_of_velocities_that_are_all_wrong_nothing_is_used(rng, swinging):
+    motion = swinging(12.0)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()
+    _, stamps, p = flown(rng, motion)
+    told = model_of([replace(s, velocity_m_s=s.velocity_m_s + 5.0) for s in samples]).positions(stamps, p)
+    assert told.refused == told.rows > 0
+    assert not told.information.any() and not told.vector.any()
+
+
 def test_an_outage_leaves_the_positions_across_it_alone(rng, swinging):
     motion = swinging(20.0)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()
