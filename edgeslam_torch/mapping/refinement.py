@@ -15,7 +15,7 @@ from edgeslam_torch.mapping.freed_depths import Weight, motion_priors
 from edgeslam_torch.mapping.motion_terms import EFFECTIVE_SAMPLES, motion_factors
 from edgeslam_torch.mapping.prior_anchors import depth_priors, mostly_on_priors
 from edgeslam_torch.mapping.window_edges import WindowEdges
-from edgeslam_torch.mapping.window_scale import MIN_EXTENT, with_same_depths, with_same_way
+from edgeslam_torch.mapping.window_scale import MIN_EXTENT, with_same_depths
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import (
     LmConfig,
@@ -32,6 +32,9 @@ UNKNOWN_SCALE_LOG = 1.0
 
 SPOT = 0.5
 """Maximum distance of the cameras of a rotation on the spot, relative to the scene depth."""
+
+_DRIFTED = 10
+"""Number of newest keyframes, a small window, that may have drifted and do not define the scale of a wide one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +92,7 @@ def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     """The newest ``most`` keyframes of a submap as one window.
 
     The earlier keyframe that shares most anchors is fixed, or its own first one without such; the length of its older
-    part fixes the scale (`with_same_way`), for which two neighbouring poses are too close. None for fewer than three
+    part fixes the scale (`with_same_depths`), for which two neighbouring poses are too close. None for fewer than three
     keyframes, a camera that never moved, or a revisit of earlier ground: its scale is determined, and the telemetry of
     one more visit would move its anchors away from the keyframes that created them.
     """
@@ -173,10 +176,10 @@ def refine(
     if window.settled and not result.stop.converged:
         return result
     if problem.scale_priors and result.stop is not StopReason.NOT_FINITE:
-        if window.is_new_map and not problem.centres:
+        if window.is_new_map:
             result = with_same_depths(problem, result, len(window.free))
-        elif window.settled:
-            result = with_same_way(problem, result, len(window.free))
+        elif window.settled:  # the newest may have drifted
+            result = with_same_depths(problem, result, len(window.free), older=len(window.free) - _DRIFTED)
     with slam_map.lock:  # a consistent snapshot for readers
         write_back(slam_map, window, keypoint, result)
         if edges is not None and placed is not None and result.stop is not StopReason.NOT_FINITE:

@@ -16,8 +16,9 @@ from edgeslam_torch.mapping.refinement import (
     refine_all,
     window_problem,
 )
+from edgeslam_torch.mapping.window_scale import with_same_depths
 from edgeslam_torch.optim.pose_only import refine_pose
-from edgeslam_torch.optim.problem import LmConfig, StopReason
+from edgeslam_torch.optim.problem import LmConfig, StopReason, WindowResult
 
 
 @pytest.fixture
@@ -251,6 +252,20 @@ def test_the_scale_of_a_new_map_is_fixed_by_refined_poses(points, rng):
     refine(points.map, new_map(points.map, newest, 25), CAMERA, LmConfig())
     after = [np.linalg.norm(k.centre_w - centre) for k in points.keyframes]
     np.testing.assert_allclose(after, distance, rtol=2e-3, atol=1e-6)
+
+
+def test_the_scale_of_a_flight_that_began_at_a_standstill_is_kept(rng):
+    """Its first keyframes differ by noise, from which a tutorial's first flight once grew eightfold in one window."""
+    points = filled(rng, 300, 14)
+    for keyframe in points.keyframes[1:4]:
+        keyframe.T_c_w = small_motion(rng, 1e-3, 1e-4) @ points.keyframes[0].T_c_w
+    window = recent_map(points.map, points.keyframes[-1], 60)
+    problem, _ = window_problem(points.map, window, CAMERA, LmConfig())
+    T_c_w = problem.T_c_w.copy()
+    T_c_w[:3] = [small_motion(rng, 5e-3, 1e-4) @ T for T in T_c_w[:3]]
+    chi2 = np.zeros(len(problem.obs_pose))
+    refined = WindowResult(T_c_w, problem.p_w, chi2, 1.0, 1.0, 1, StopReason.STEP_CONVERGED)
+    np.testing.assert_allclose(with_same_depths(problem, refined, 13, 3).p_w, problem.p_w, rtol=0.01, atol=0.01)
 
 
 def test_only_a_small_map_is_new(points):
