@@ -189,12 +189,6 @@ class MotionFusion:
         """Metres per map unit with sigma and source; unchanged without new measurements."""
         return self.metres.scale()
 
-    def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
-        """As `Orientation.vertical`; None if the map did not begin upright, or has a metric scale: attitude in whole
-        degrees is worse than a map with parallax."""
-        usable = self.metres.sensor_scale is None and self.orientation.began_upright
-        return self.orientation.vertical(stamp_s) if usable else None
-
     @property
     def filtering(self) -> bool:
         """Whether the Kalman filter receives visual updates and predicts the camera."""

@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from edgeslam_torch.estimation.scale.camera_mount import Turned, mount_by_turns
-from edgeslam_torch.estimation.sensors.attitude import is_steady
 from edgeslam_torch.estimation.telemetry.alignment import LATELY, attitudes
 from edgeslam_torch.estimation.telemetry.comparison import MAX_DEVIATION_RAD
 from edgeslam_torch.estimation.telemetry.remembered import Remembered
@@ -79,18 +78,6 @@ class Orientation:
         return (
             float(np.linalg.norm(rotation_vector(pairs.map_to_world(found.R_b_c) @ found.R_w_m.T))) > MAX_DEVIATION_RAD
         )
-
-    def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
-        """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and its maximum error [rad] due to the
-        uncertain delay; None without usable attitude. For a map that `began_upright`."""
-        flight = self._flight
-        at_s = np.array([stamp_s - flight.delay_s])
-        if not (flight.trust.attitude and flight.track.covered(at_s, at_s)[0]):
-            return None
-        if not (flight.trust.turns or is_steady(flight.track, at_s)[0]):
-            return None
-        leaned = flight.track.leaned(at_s, min(flight.delay_sigma_s, DELAY_S))
-        return self.given[:3, :3].T @ flight.track.attitude(at_s)[0, 2], float(leaned[0])
 
     def upright(self) -> FloatArray | None:
         """``R_w_m`` if attitude may level the world: when it was validated, or arrived with the first frame."""

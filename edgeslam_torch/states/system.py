@@ -19,9 +19,9 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
+from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.stage_times import timed
 from edgeslam_torch.tracking.motion_model import MotionModel
-from edgeslam_torch.tracking.pose_prior import TrackingPrior, Vertical
 from edgeslam_torch.tracking.relocaliser import Reach, reach_after
 from edgeslam_torch.tracking.tracker import Track, Tracker
 from edgeslam_torch.types import FloatArray, Frame, TelemetrySample
@@ -111,17 +111,11 @@ class System:
             T_c_w[:3, 3] = -T_c_w[:3, :3] @ centre
         return T_c_w
 
-    def pose_prior(self, stamp_s: float, T_predicted: FloatArray) -> TrackingPrior | None:
-        """The predicted pose with the uncertainty due to accelerations; None without a scale.
-
-        In a new map it includes the drone's roll and pitch: with little parallax a climb looks like a turn.
-        """
+    def pose_prior(self, stamp_s: float, T_predicted: FloatArray) -> PosePrior | None:
+        """The predicted pose with the uncertainty due to accelerations; None without a scale."""
         if not self.mapping.has_metres:
             return None
-        up = self.fusion.vertical(stamp_s) if self._is_new(stamp_s) else None
-        vertical = None if up is None else Vertical(*up)
-        by_motion = self.motion.pose_prior(stamp_s, T_predicted, self.published.scale)
-        return TrackingPrior(by_motion, vertical)
+        return self.motion.pose_prior(stamp_s, T_predicted, self.published.scale)
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""

@@ -11,7 +11,7 @@ from edgeslam_torch.map.keyframe import Keyframe, make_keyframe, tracked_motion
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.prior_anchors import prior_of
 from edgeslam_torch.mapping.refinement import Window, refine
-from edgeslam_torch.optim.problem import LmConfig
+from edgeslam_torch.optim.problem import LmConfig, PosePrior
 from edgeslam_torch.tracking.initialiser import (
     MIN_POINTS,
     BootstrapView,
@@ -24,7 +24,6 @@ from edgeslam_torch.tracking.initialiser import (
     poses_between,
     triangulated,
 )
-from edgeslam_torch.tracking.pose_prior import TrackingPrior
 from edgeslam_torch.tracking.relative_pose import rotation_residual
 from edgeslam_torch.tracking.tracker import MOTION_RADIUS_PX, Track, Tracker, View
 from edgeslam_torch.types import FloatArray, Frame, IntArray
@@ -122,7 +121,7 @@ class Bootstrap:
         with self.map.lock:
             self.map.remove_anchors(self._guessed)
 
-    def track(self, view: View, T_predicted: FloatArray, expected: TrackingPrior | None = None) -> Track | None:
+    def track(self, view: View, T_predicted: FloatArray, expected: PosePrior | None = None) -> Track | None:
         """Pose against the predicted map; the pose is rough, the matches are reliable."""
         radius = 2.0 * MOTION_RADIUS_PX
         track = self.tracker.refine(view, T_predicted, self._guessed, radius, expected=expected)

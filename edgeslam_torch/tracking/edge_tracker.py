@@ -18,7 +18,7 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.optim.pose_only import MIN_POINTS, PoseConfig, PoseResult, refine_pose
-from edgeslam_torch.tracking.pose_prior import TrackingPrior
+from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray, IntArray
 
 HOSTS = 5
@@ -105,7 +105,7 @@ class EdgeTracker:
         grey: NDArray[np.uint8],
         T_c_w: FloatArray,
         points: PointsInFrame | None = None,
-        expected: TrackingPrior | None = None,
+        expected: PosePrior | None = None,
     ) -> EdgePose | None:
         """Pose near a predicted one from edges and points; None without measured edges or with too few inliers.
 
@@ -135,7 +135,7 @@ class EdgeTracker:
         return EdgePose(T_c_w, result.covariance, result.inliers[:count], len(edges.uv), in_view, depth)
 
     def _solve(
-        self, T_c_w: FloatArray, points: PointsInFrame, edges: PointsInFrame, expected: TrackingPrior | None
+        self, T_c_w: FloatArray, points: PointsInFrame, edges: PointsInFrame, expected: PosePrior | None
     ) -> PoseResult:
         camera = self.camera
         return refine_pose(
@@ -145,7 +145,7 @@ class EdgeTracker:
             np.concatenate([points.inv_sigma, edges.inv_sigma]),
             (camera.fx, camera.fy, camera.cx, camera.cy),
             slack_px=np.concatenate([points.slack_px, edges.slack_px]),
-            prior=None if expected is None else expected.by_motion,
+            prior=expected,
             config=EFFORT,
         )
 

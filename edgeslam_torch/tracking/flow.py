@@ -18,7 +18,8 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.tracking.pose_prior import TrackingPrior, pose_on_anchors
+from edgeslam_torch.optim.problem import PosePrior
+from edgeslam_torch.tracking.pose_prior import pose_on_anchors
 from edgeslam_torch.tracking.tracker import FINE, Track, View
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
@@ -175,7 +176,7 @@ class FlowTracker:
         self._chosen = _Chosen(None, -1, np.zeros(0, dtype=np.int64))
 
     def follow(
-        self, template: Template, grey: NDArray[np.uint8], T_c_w: FloatArray, expected: TrackingPrior | None = None
+        self, template: Template, grey: NDArray[np.uint8], T_c_w: FloatArray, expected: PosePrior | None = None
     ) -> Followed | None:
         """Pose near a predicted one, or None if hardly any keypoint is tracked.
 
@@ -214,7 +215,7 @@ class FlowTracker:
         guess: FloatArray,
         T_c_w: FloatArray,
         levels: int,
-        expected: TrackingPrior | None,
+        expected: PosePrior | None,
     ) -> tuple[Track, FloatArray]:
         """Pose from flow over the given pyramid levels, and the inliers' undistorted pixels."""
         raw_uv, found = self._flow(template, grey, keypoint, guess, levels)
@@ -263,7 +264,7 @@ class FlowTracker:
         return np.asarray(uv, dtype=np.float32).reshape(-1, 2), found
 
     def _solve(
-        self, template: Template, keypoint: IntArray, uv: FloatArray, T_c_w: FloatArray, expected: TrackingPrior | None
+        self, template: Template, keypoint: IntArray, uv: FloatArray, T_c_w: FloatArray, expected: PosePrior | None
     ) -> Track:
         # Flow inherits the localisation error of the keyframe's keypoint: same weight as a match.
         anchor = template.anchor[keypoint]

@@ -14,7 +14,8 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.projection import Projection, match_projection, project_anchors
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.optim.pose_only import PoseConfig
-from edgeslam_torch.tracking.pose_prior import TrackingPrior, pose_on_anchors
+from edgeslam_torch.optim.problem import PosePrior
+from edgeslam_torch.tracking.pose_prior import pose_on_anchors
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
 ROUGH = PoseConfig(rounds=1, robust_rounds=1, iterations=5, cost_tolerance=1e-2)
@@ -96,9 +97,7 @@ class Tracker:
         self.orb = orb
         self.config = config
 
-    def track(
-        self, view: View, T_c_w: FloatArray, recent: IntArray, expected: TrackingPrior | None = None
-    ) -> Track | None:
+    def track(self, view: View, T_c_w: FloatArray, recent: IntArray, expected: PosePrior | None = None) -> Track | None:
         """Pose near a predicted one: anchors of the last frame first, then the local map; None with too few
         inliers."""
         some = recent[:: 1 + len(recent) // ENOUGH_FOR_ROUGH]
@@ -110,7 +109,7 @@ class Tracker:
         return self._complete(view, first.T_c_w, first.anchor, first.keypoint, first.anchor, expected)
 
     def track_near(
-        self, view: View, T_c_w: FloatArray, recent: IntArray, expected: TrackingPrior | None = None
+        self, view: View, T_c_w: FloatArray, recent: IntArray, expected: PosePrior | None = None
     ) -> Track | None:
         """The same from a pose accurate to a pixel or two, without the first pass."""
         return self._complete(view, T_c_w, recent, recent[:0], recent[:0], expected)
@@ -128,7 +127,7 @@ class Tracker:
         anchor_ids: IntArray,
         radius_px: float,
         effort: PoseConfig = FINE,
-        expected: TrackingPrior | None = None,
+        expected: PosePrior | None = None,
     ) -> Track | None:
         """Match the given anchors around their predicted pixels and refine the pose on the matches."""
         seen = self.expected(T_c_w, anchor_ids)
@@ -142,7 +141,7 @@ class Tracker:
         recent: IntArray,
         keypoint: IntArray,
         anchor: IntArray,
-        expected: TrackingPrior | None,
+        expected: PosePrior | None,
     ) -> Track | None:
         """Track against the local map around ``recent``; known matches are kept."""
         anchors = self.map.anchors
@@ -183,7 +182,7 @@ class Tracker:
         keypoint: IntArray,
         anchor: IntArray,
         effort: PoseConfig = FINE,
-        expected: TrackingPrior | None = None,
+        expected: PosePrior | None = None,
     ) -> Track | None:
         """Robust pose from given matches; None with too few of them."""
         if len(keypoint) < 6:

@@ -93,6 +93,16 @@ def test_a_verdict_is_kept_until_contradicted_and_velocities_rest_on_attitude():
     assert used == [True, True, False, True, False]
 
 
+@pytest.mark.parametrize("correlation", [0.3, -0.3])
+def test_few_height_changes_count_beside_validated_velocities_unless_they_go_the_other_way(correlation):
+    trust = SensorGate()
+    trust.judge(Reading.VELOCITY, Agreement(0.95, 20))
+    assert trust.height(Reading.BARO), "before any comparison"
+    trust.judge(Reading.BARO, Agreement(correlation, 6, dimensions=1))
+    assert trust.verdict(Reading.BARO) is Verdict.OPEN
+    assert trust.height(Reading.BARO) == (correlation > 0.0)
+
+
 # --- flights -------------------------------------------------------------------------------------------------------
 
 
@@ -361,10 +371,13 @@ def test_velocities_in_the_wrong_unit_are_named_and_the_scale_covers_them(told_o
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("random", [True, False])
-def test_heights_that_do_not_climb_with_the_images_are_not_used(told_of, swinging, replay, random):
+@pytest.mark.parametrize("kind", ["random", "stuck", "mirrored"])
+def test_heights_that_do_not_climb_with_the_images_are_not_used(told_of, swinging, replay, kind):
     def spoil(rng, samples, motion):
-        z = rng.uniform(0.3, 2.0, len(samples)) if random else np.ones(len(samples))
+        true = np.array([s.tof_m for s in samples])
+        z = {"random": rng.uniform(0.3, 2.0, len(samples)), "stuck": np.ones(len(samples)), "mirrored": 3.0 - true}[
+            kind
+        ]
         return [replace(s, tof_m=x, height_m=x, baro_m=x) for s, x in zip(samples, z.tolist(), strict=True)]
 
     _, fusion, gauge = told_of(swinging(18.0, 10.0, size_m=0.5), spoil, replay)

@@ -268,12 +268,14 @@ class SensorGate:
         return self.elsewhere_s is None and self.verdict(Reading.ATTITUDE) is Verdict.AGREES
 
     def height(self, reading: Reading) -> bool:
-        """Whether a height is usable: it needs the vertical, and its own validation if no other reading is
-        validated."""
+        """Whether a height is usable: it needs the vertical, and its own validation if no other reading is validated.
+        One that sinks while the images climb is not used, although few changes are no proof."""
         attitude, own = self.verdict(Reading.ATTITUDE), self.verdict(reading)
         if self.elsewhere_s is not None or attitude is Verdict.CONTRADICTS:
             return False
-        return own is Verdict.AGREES or (own is Verdict.OPEN and (self.velocity or attitude is Verdict.AGREES))
+        opposite = self.latest.get(reading, Agreement()).correlation < 0.0
+        vouched = self.velocity or attitude is Verdict.AGREES
+        return own is Verdict.AGREES or (own is Verdict.OPEN and vouched and not opposite)
 
     @property
     def motion(self) -> bool:
