@@ -91,8 +91,8 @@ def new_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
 def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     """The newest ``most`` keyframes of a submap as one window.
 
-    The earlier keyframe that shares most anchors is fixed, or its own first one without such; the length of its older
-    part fixes the scale (`with_same_depths`), for which two neighbouring poses are too close. None for fewer than three
+    The earlier keyframe that shares most anchors is fixed, or its own first one without such; the depths of its older
+    part fix the scale (`with_same_depths`), for which two neighbouring poses are too close. None for fewer than three
     keyframes, a camera that never moved, or a revisit of earlier ground: its scale is determined, and the telemetry of
     one more visit would move its anchors away from the keyframes that created them.
     """
