@@ -209,7 +209,7 @@ class EdgeSlam:
         shown, estimate, published = self.support().largest(), self.scale, self._system.published
         relative = replace(estimate, value=estimate.value / published.scale, sigma=estimate.sigma / published.scale)
         units = {piece: Unit(np.eye(4), known) for piece, known in self._joining.atlas.known_scale.items()}
-        units[shown] = Unit(sim3.compose(published.scale, published.R, published.offset), relative)
+        units[shown] = Unit(sim3.compose(published.scale, published.R, np.zeros(3)), relative)
         return pack(self.map, self.edges, self.camera, (*self._earlier.flights, flight), units)
 
     def prepare(self, frame: Frame) -> LazyView:
@@ -334,7 +334,7 @@ class EdgeSlam:
         if up is None:
             return
         if not (self._earlier.pieces and system.published.upright):
-            system.published = system.published.levelled(up.direction, np.zeros(3))
+            system.published = system.published.levelled(up.direction)
         self.up = replace(up, direction=system.published.R @ up.direction)
 
     def trajectory(self) -> tuple[FloatArray, FloatArray]:

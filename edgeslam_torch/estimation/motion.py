@@ -208,12 +208,10 @@ class MotionFusion:
                 return Up(*found, source)
         return None
 
-    def republished(self, published: OutputFrame, centre_map: FloatArray) -> OutputFrame:
-        """The published frame, levelled and with the present scale; the published position of ``centre_map`` ``(3,)``
-        stays."""
+    def republished(self, published: OutputFrame) -> OutputFrame:
+        """The published frame, levelled and with the present scale."""
         upright = self.orientation.upright()
-        published = published.turned_upright(self.imu.upright() if upright is None else upright, centre_map)
-        return published.revised(self.scale(), centre_map)
+        return published.turned_upright(self.imu.upright() if upright is None else upright).revised(self.scale())
 
     def present(
         self, stamp_s: float, state: str, published: OutputFrame, submap_sigma: float = 0.0, drift_sigma: float = 0.0

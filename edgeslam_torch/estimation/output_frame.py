@@ -1,8 +1,9 @@
 """Transform from map units and axes to the published world: metric and z up, each if known.
 
-The map itself is never rescaled. Its units are published as they are until reliable sensors contradict them; the
-revision then rescales about the camera, so that the live pose does not jump. A map that began before the attitude was
-known is levelled once. Final results without telemetry are levelled by `mapping/level/`.
+The map itself is never rescaled. Its units are published as they are until reliable sensors contradict them. A revision
+rescales about the origin, where the flight began: positions after it are right at once, and those published before
+carry the revision of their unit. A map that began before the attitude was known is levelled once, likewise. Final
+results without telemetry are levelled by `mapping/level/`.
 """
 
 import math
@@ -34,11 +35,10 @@ MEASURED = frozenset({"telemetry", "height", "imu"})
 
 @dataclass(frozen=True, slots=True)
 class OutputFrame:
-    """Similarity ``p_published = scale R p_map + offset``."""
+    """Similarity ``p_published = scale R p_map``."""
 
     scale: float = 1.0
     R: FloatArray = field(default_factory=lambda: np.eye(3))
-    offset: FloatArray = field(default_factory=lambda: np.zeros(3))
     revision: int = 0
     """Number of revisions so far."""
     sigma: float = math.inf
@@ -55,7 +55,7 @@ class OutputFrame:
 
     def points(self, p: FloatArray) -> FloatArray:
         """Points ``(..., 3)`` of the map as published."""
-        return self.scale * (p @ self.R.T) + self.offset
+        return self.scale * (p @ self.R.T)
 
     def cloud(self, cloud: PointCloud) -> PointCloud:
         """A point cloud of the map as published."""
@@ -75,38 +75,33 @@ class OutputFrame:
         """Deviation of the published scale from an estimate, in the logarithm."""
         return abs(math.log(estimate.value / self.scale))
 
-    def turned_upright(self, R_w_m: FloatArray | None, centre_map: FloatArray) -> "OutputFrame":
+    def turned_upright(self, R_w_m: FloatArray | None) -> "OutputFrame":
         """The same with z up, by the smallest rotation, if it is not yet level and the attitude is known.
 
         Args:
             R_w_m: Rotation ``(3, 3)`` from the map to a world whose z is up; None while unknown.
-            centre_map: Point of the map ``(3,)`` whose published position stays.
         """
         if self.upright or R_w_m is None:
             return self
-        turned = self.levelled(R_w_m[2], centre_map)
-        return replace(turned, revision=self.revision + 1, upright=True)
+        return replace(self.levelled(R_w_m[2]), revision=self.revision + 1, upright=True)
 
-    def levelled(self, up_map: FloatArray, centre_map: FloatArray) -> "OutputFrame":
-        """The same with a direction ``(3,)`` of the map up, by the smallest rotation; ``centre_map`` as above."""
-        R = smallest_rotation(self.R @ up_map, np.array([0.0, 0.0, 1.0])) @ self.R
-        return replace(self, R=R, offset=self.offset + self.scale * ((self.R - R) @ centre_map))
+    def levelled(self, up_map: FloatArray) -> "OutputFrame":
+        """The same with a direction ``(3,)`` of the map up, by the smallest rotation."""
+        return replace(self, R=smallest_rotation(self.R @ up_map, np.array([0.0, 0.0, 1.0])) @ self.R)
 
-    def revised(self, estimate: ScaleEstimate, centre_map: FloatArray) -> "OutputFrame":
+    def revised(self, estimate: ScaleEstimate) -> "OutputFrame":
         """The same at an estimated scale, if that is measured, and is much more accurate than the published one or
         accurate and contradicts it.
 
         Args:
             estimate: Metres per map unit.
-            centre_map: Point of the map ``(3,)`` whose published position stays.
         """
         sigma = estimate.sigma / estimate.value
         better = sigma < _IMPROVED * self.sigma and self._off(estimate) > sigma
         measured = not MEASURED.isdisjoint(estimate.source.split("+"))
         if not (measured and (better or (sigma < SURE and self.contradicts(estimate)))):
             return self
-        offset = self.offset + (self.scale - estimate.value) * (self.R @ centre_map)
-        return replace(self, scale=estimate.value, offset=offset, revision=self.revision + 1, sigma=sigma)
+        return replace(self, scale=estimate.value, revision=self.revision + 1, sigma=sigma)
 
 
 def first_pose(rpy_rad: FloatArray, T_b_c: FloatArray) -> FloatArray:

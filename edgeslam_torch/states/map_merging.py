@@ -39,7 +39,7 @@ class MapMerging:
         if known is None:
             return
         published = replace(system.published, upright=True)
-        if published.scale != known.value or published.offset.any() or not np.array_equal(published.R, np.eye(3)):
+        if published.scale != known.value or not np.array_equal(published.R, np.eye(3)):
             sigma = known.sigma / known.value
             published = OutputFrame(known.value, revision=published.revision + 1, sigma=sigma, upright=True)
         system.published = published

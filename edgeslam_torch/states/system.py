@@ -129,7 +129,7 @@ class System:
         T_w_c = se3.inverse(track.T_c_w)
         with self.timed("fusion"):
             self.fusion.add_visual(stamp_s, T_w_c, *_sigmas(track))
-            self.published = self.fusion.republished(self.published, T_w_c[:3, 3])
+            self.published = self.fusion.republished(self.published)
 
     def position_sigmas(self, piece: int) -> tuple[float, float]:
         """`Health.submap_sigma` and `drift_sigma` of the present pose in a submap."""
@@ -144,7 +144,7 @@ class System:
         stamps_s, T_w_c = self.log.poses(since_s)
         with self.timed("fusion"):
             self.fusion.add_earlier(stamps_s, T_w_c, *_sigmas(track))
-            self.published = self.fusion.republished(self.published, se3.inverse(self.motion.T_c_w)[:3, 3])
+            self.published = self.fusion.republished(self.published)
 
     def begin_submap(self, keyframe: Keyframe) -> None:
         """A submap begins with a keyframe at the present, predicted pose."""
