@@ -72,7 +72,7 @@ class EdgePose:
     T_c_w: FloatArray
     """``(4, 4)``"""
     covariance: FloatArray
-    """``(6, 6)`` of its left tangent."""
+    """``(6, 6)`` of its left tangent, from points and edges alone; NaN where they do not constrain it."""
     points: NDArray[np.bool_]
     """``(M,)`` inliers of the given points."""
     edges: int
@@ -132,7 +132,8 @@ class EdgeTracker:
         edges, in_view = self._match(seen, known, T_c_w, AGREE_PX)
         z = se3.transform(T_c_w, known.p_w)[:, 2]
         depth = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
-        return EdgePose(T_c_w, result.covariance, result.inliers[:count], len(edges.uv), in_view, depth)
+        covariance = result.covariance if expected is None else _without(expected, result.covariance)
+        return EdgePose(T_c_w, covariance, result.inliers[:count], len(edges.uv), in_view, depth)
 
     def _solve(
         self, T_c_w: FloatArray, points: PointsInFrame, edges: PointsInFrame, expected: PosePrior | None
@@ -230,6 +231,18 @@ class EdgeImage:
         u, v = np.rint(uv).astype(np.int64).T
         row = self.label[v, u]
         return self.pixel[row], self.normal[row], self.distance[v, u] <= reach_px
+
+
+def _without(prior: PosePrior, covariance: FloatArray) -> FloatArray:
+    """Covariance ``(6, 6)`` of the measurements of a pose refined with a prior; NaN where they do not constrain it.
+
+    Otherwise the prediction of every frame would pass for a measurement.
+    """
+    if np.isfinite(covariance).all():
+        values, vectors = np.linalg.eigh(np.linalg.inv(covariance) - prior.information)
+        if values[0] > 0.0:
+            return np.asarray((vectors / values) @ vectors.T)
+    return np.full((6, 6), np.nan)
 
 
 def _nearest(keyframes: list[Keyframe], T_c_w: FloatArray) -> list[Keyframe]:

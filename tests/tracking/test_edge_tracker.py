@@ -13,6 +13,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.tracking.edge_tracker import EdgeImage, EdgeTracker, PointsInFrame
 
 STRIPES = np.repeat((np.arange(320) // 20 % 2 * 120 + 60)[None].astype(np.uint8), 240, axis=0)
@@ -106,6 +107,21 @@ def test_parallel_lines_do_not_constrain_a_pose():
     pose = tracker.refine(STRIPES, np.eye(4))
     assert pose.edges > 500
     assert not pose.is_fixed
+
+
+def test_a_prediction_is_no_measurement():
+    """Before parallel lines it is all that fixes the pose; where edges fix it, it takes no part in their covariance."""
+    expected = PosePrior(0, np.eye(4), np.diag([0.02**-2.0] * 3 + [0.02**-2.0] * 3))
+    pose = tracker_on(STRIPES, np.full((240, 320), 2.0), np.eye(4)).refine(STRIPES, np.eye(4), None, expected)
+    assert pose.edges > 500
+    assert not pose.is_fixed
+
+
+def test_the_covariance_is_that_of_the_edges(flight, tracker):
+    T_c_w = se3.inverse(flight.T_w_c[1])
+    expected = PosePrior(0, T_c_w, np.diag([0.005**-2.0] * 3 + [0.002**-2.0] * 3))
+    alone, both = (tracker.refine(grey_of(flight, 1), T_c_w, None, prior) for prior in (None, expected))
+    np.testing.assert_allclose(np.diag(both.covariance), np.diag(alone.covariance), rtol=0.2)
 
 
 def test_an_image_of_another_place_is_rejected(tracker, flight, rng):
