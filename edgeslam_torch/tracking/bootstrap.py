@@ -37,6 +37,10 @@ LAST_CHANCE_DEG = 0.5
 """`InitialisationConfig.min_parallax_deg` of the last frame that sees enough of the reference: 4 px at a focal length
 of 500 px. Below it, motion is known to 30 degrees or less, whatever its covariance says."""
 
+PATIENCE_S, PATIENT_DEG = 2.0, 0.3
+"""`InitialisationConfig.min_parallax_deg`, 2.6 px, of a camera that has moved by as much for longer, and stays: most of
+the parallax of a plane, as of a wall before a drone that climbs and sinks, is explained by a rotation."""
+
 SAME_PICTURE_PX = 1.0
 """Median motion of the keypoints up to which a frame shows the reference's view. A static camera, or a repeated image,
 matches all keypoints, which is no standard for later frames."""
@@ -115,6 +119,8 @@ class Bootstrap:
             slam_map.add_keyframe(reference)
             slam_map.refresh_anchors(ids)
         self._guessed = ids
+        self._moved_s = np.inf
+        """Stamp of the first frame with `PATIENT_DEG`."""
 
     def forget_guess(self) -> None:
         """Remove the predicted anchors from the map; the caller removes the reference keyframe."""
@@ -140,14 +146,14 @@ class Bootstrap:
         keypoint_of_anchor[self.reference.anchor] = np.arange(len(self.reference.anchor))
         return keypoint_of_anchor[track.matched_anchor]
 
-    def two_views(self, frame_index: int, view: View, track: Track, leaving: bool = False) -> TwoView:
+    def two_views(self, frame: Frame, view: View, track: Track, leaving: bool = False) -> TwoView:
         """Store the frame's matches and estimate the structure of all frames so far from those of corners.
 
         Keypoints on edges slide along them (aperture problem): hundreds on a panelled wall fit an essential matrix of a
         wrong motion, with a sharp minimum.
 
         Args:
-            frame_index: Index of the frame.
+            frame: The frame.
             view: Its features.
             track: Its matches.
             leaving: Whether it is the last one that sees enough of the reference.
@@ -155,7 +161,7 @@ class Bootstrap:
         reference, camera, keypoint = self.reference, self.tracker.camera, track.matched_keypoint
         reference_keypoint = self._reference_keypoints(track)
         uv, inv_sigma = view.features.uv[keypoint], view.inv_sigma[keypoint]
-        self.views.append(BootstrapView(frame_index, uv, inv_sigma, reference_keypoint, track.T_c_w))
+        self.views.append(BootstrapView(frame.index, uv, inv_sigma, reference_keypoint, track.T_c_w))
         if len(self.views) == 1 and not leaving:  # matches of repetitive texture fit many motions of two views
             return TwoView("two views need a third")
         both = reference.features.on_corners(reference_keypoint) & view.features.on_corners(keypoint)
@@ -165,6 +171,10 @@ class Bootstrap:
         least = np.deg2rad(self.config.min_parallax_deg)
         awaited = min(least, np.deg2rad(LAST_CHANCE_DEG)) if leaving else least
         angle = self._rotation_residual(view, reference_keypoint, keypoint)
+        if angle >= np.deg2rad(PATIENT_DEG):
+            self._moved_s = min(self._moved_s, frame.stamp_s)
+        if frame.stamp_s - self._moved_s > PATIENCE_S:
+            awaited = min(least, np.deg2rad(PATIENT_DEG))
         if angle < awaited:
             return TwoView("no parallax yet", angle)
         p_r = camera.back_project(reference.features.uv[reference_keypoint], self.guess_depth[reference_keypoint])
