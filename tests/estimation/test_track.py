@@ -58,3 +58,14 @@ def test_copy_is_equal_and_independent(turn: Turn) -> None:
     track.add(samples[205:])
     np.testing.assert_array_equal(track.readings.tof, [s.tof_m for s in samples])
     assert len(copied.readings.stamp_s) == 201
+
+
+@pytest.mark.parametrize("climbs", [True, False])
+def test_a_steady_climb_is_no_frozen_link(climbs: bool) -> None:
+    """Velocity and attitude stay within their steps of 0.1 m/s and 1 degree; heights do not."""
+    up = np.array([0.0, 0.0, 0.4])
+    height_m = [0.04 * k if climbs else 0.4 for k in range(40)]
+    track = TelemetryTrack("world", 0.35)
+    track.add([TelemetrySample(0.1 * k, up, np.zeros(3), baro_m=100.0 + z) for k, z in enumerate(height_m)])
+    assert (not track.readings.frozen.any()) == climbs
+    assert (not track.warnings()) == climbs

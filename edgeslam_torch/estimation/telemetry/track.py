@@ -14,8 +14,8 @@ from edgeslam_torch.geometry.rotations import matrices_from_rpy
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
 _FROZEN_S = 1.5
-"""Duration of identical non-zero velocity and attitude after which the link is considered frozen, repeating its last
-packet."""
+"""Duration of identical moving messages after which the link is considered frozen, repeating its last packet. In a
+steady climb velocity and attitude are constant, in steps of 0.1 m/s and 1 degree, but not the heights."""
 
 
 _PACKET_S = 0.15
@@ -224,7 +224,7 @@ class TelemetryTrack:
             baro=self._column("baro_m"),
             has_velocity=_all(np.isfinite(reported)),
             has_attitude=_known_lately(stamp, _all(np.isfinite(raw_rpy)), self._max_gap_s),
-            frozen=_frozen(stamp, reported, raw_rpy),
+            frozen=_frozen(self._table),
         )
 
     def displacement(self, stamps_s: FloatArray, shortfall_m_s: float = 0.0) -> FloatArray:
@@ -416,9 +416,10 @@ def cubic(stamp: FloatArray, p: FloatArray, v: FloatArray, at: FloatArray) -> Fl
     return start + s**2 * ((3.0 - 2.0 * s) * p[left + 1] - (1.0 - s) * step * v[left + 1])
 
 
-def _frozen(stamp: FloatArray, velocity: FloatArray, rpy: FloatArray) -> NDArray[np.bool_]:
-    """Readings in a run of identical non-zero messages longer than plausible in flight."""
-    same = _all(velocity[1:] == velocity[:-1]) & _all(rpy[1:] == rpy[:-1])
+def _frozen(table: FloatArray) -> NDArray[np.bool_]:
+    """Samples ``(N, 11)`` in a run of identical moving ones longer than plausible in flight."""
+    stamp, values = table[:, 0], table[:, 1:]
+    same = np.all((values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1])), axis=1)
     run = np.concatenate([[0], np.cumsum(~same)])
     first, last = np.searchsorted(run, run, side="left"), np.searchsorted(run, run, side="right") - 1
-    return ~_all(velocity == 0) & (stamp[last] - stamp[first] > _FROZEN_S)
+    return ~_all(table[:, _COLUMNS["velocity_m_s"]] == 0) & (stamp[last] - stamp[first] > _FROZEN_S)
