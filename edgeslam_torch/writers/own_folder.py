@@ -13,6 +13,7 @@ from typing import BinaryIO
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.plain import open_plain, open_shared
 from edgeslam_torch.readers.images import image_files
+from edgeslam_torch.readers.layouts import layout_of
 from edgeslam_torch.readers.video import SUFFIXES as VIDEOS
 
 try:
@@ -55,7 +56,9 @@ def _foreign(folder: Path, outputs: Collection[str]) -> str | None:
     if name is not None:
         return name
     media = [*image_files(folder), *(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS)]
-    return media[0].name if media else None
+    if media:
+        return media[0].name
+    return "a recording" if layout_of(folder) is not None else None
 
 
 def _is_run(folder: Path) -> bool:

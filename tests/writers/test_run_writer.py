@@ -177,6 +177,16 @@ def test_a_recording_is_refused_although_a_run_of_old_wrote_into_it(tmp_path):
         RunWriter(tmp_path)
 
 
+def test_a_recording_of_any_layout_is_refused_but_a_run_that_keeps_images_is_none(tmp_path, write_images):
+    write_images(tmp_path / "kitti" / "image_0", ["000000.png"])
+    (tmp_path / "kitti" / "times.txt").write_text("0\n")
+    with pytest.raises(OutputError, match="holds a recording, which no run wrote"):
+        RunWriter(tmp_path / "kitti")
+    leave_run(tmp_path / "run")
+    write_images(tmp_path / "run" / "images", ["0.000000.jpg"])
+    RunWriter(tmp_path / "run").close()
+
+
 @pytest.mark.parametrize("left", [["status.csv", "config.toml"], ["summary.json", "camera.yaml"]])
 def test_what_is_left_of_a_run_is_known_as_a_run(tmp_path, left):
     leave_run(tmp_path / "run")
