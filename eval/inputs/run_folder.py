@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import nearest
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.files.record_files import read_mapping, recording_of
 from edgeslam_torch.files.tables import read_text
+from edgeslam_torch.readers.layouts import read_sequence
 from edgeslam_torch.types import PointCloud
 from edgeslam_torch.writers.ply import read_ply
 from edgeslam_torch.writers.run_summary import vertical_text
@@ -82,9 +84,7 @@ class RunFolder:
     def own_truth(self) -> Path | None:
         """Ground truth of the recording that the run read, when it is still there, or in the run's own folder."""
         folder = self.source
-        if folder is not None and (
-            (folder / "groundtruth.txt").is_file() or (folder / "mav0").is_dir() or any(folder.glob("*.pose.txt"))
-        ):
+        if folder is not None and _has_truth(folder):
             return folder
         files = (self.path / name for name in ("groundtruth.txt", "ground_truth.txt"))
         return next((file for file in files if file.is_file()), None)
@@ -122,6 +122,17 @@ def open_run(path: Path | str) -> RunFolder:
         read_status(path / "status.csv"),
         read_summary(path / "summary.json"),
     )
+
+
+def _has_truth(recording: Path) -> bool:
+    """Whether true poses lie in the folder, or where its layout has them."""
+    if (recording / "groundtruth.txt").is_file():
+        return True
+    try:
+        sequence = read_sequence(recording)
+    except EdgeSlamError:  # damaged since the run
+        return False
+    return sequence is not None and sequence.groundtruth is not None
 
 
 def is_keyframe(row: dict[str, str]) -> bool:

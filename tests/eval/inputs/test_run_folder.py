@@ -1,5 +1,7 @@
 """A run's folder as evaluation reads it."""
 
+import json
+
 import pytest
 
 from edgeslam_torch.eval.errors import EvaluationError
@@ -17,6 +19,28 @@ def test_rows_are_those_of_the_poses_where_a_run_is_in_pieces(tmp_path):
     assert [is_supported(row) for row in run.pose_rows] == [True, True, True, False]
     assert run.trusted_frames == 3
     assert len(run.status) == 6
+
+
+@pytest.mark.parametrize(
+    ("recording", "files"),
+    [
+        ("plain", ["plain/groundtruth.txt"]),
+        ("sequences/00", ["sequences/00/times.txt", "sequences/00/image_0/000000.png", "poses/00.txt"]),
+        ("mav0/cam0", ["mav0/cam0/data.csv", "mav0/cam0/data/0.png", "mav0/state_groundtruth_estimate0/data.csv"]),
+    ],
+)
+def test_the_truth_of_a_recording_of_any_layout_is_the_runs_own(tmp_path, recording, files):
+    for name in files:
+        path = tmp_path / "data" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("0,0.png\n" if path.name == "data.csv" else "0\n")
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "trajectory.txt").write_text("".join(f"{i} {i} 0 0 0 0 0 1\n" for i in range(3)))
+    (run / "summary.json").write_text(json.dumps({"source": {"path": f"../data/{recording}"}}))
+    assert open_run(run).own_truth == run / f"../data/{recording}"
+    (tmp_path / "data" / files[-1]).unlink()
+    assert open_run(run).own_truth is None
 
 
 @pytest.mark.parametrize("row", ["stamp_s,scale", "x,1", "1,x", "1,\xff", '1,"' + 200_000 * "x"])
