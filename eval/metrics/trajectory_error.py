@@ -277,8 +277,8 @@ def score_common(
 ) -> list[CommonScore]:
     """Judge named trajectories on their common frames, each with its own alignment.
 
-    A frame is common when every trajectory has a pose within ``max_dt_s`` of it; the frames looked at are those of the
-    shortest trajectory (a keyframe trajectory has few).
+    A frame is common when every trajectory has a pose within ``max_dt_s`` of it that is nearer to no other frame; the
+    frames looked at are those of the shortest trajectory (a keyframe trajectory has few).
 
     Raises:
         EvaluationError: If they share fewer than two frames with each other and the ground truth.
@@ -294,7 +294,7 @@ def score_common(
         found = nearest(estimate.stamps_s, frames)
         kept &= np.abs(estimate.stamps_s[found] - frames) <= max_dt_s
         # One pose serves one frame.
-        kept &= np.concatenate([[True], np.diff(found) > 0])
+        kept &= nearest(frames, estimate.stamps_s[found]) == np.arange(len(frames))
     if kept.sum() < 2:
         names = ", ".join(name for name, _ in clocked)
         raise EvaluationError(f"{names}: {int(kept.sum())} frame(s) in common; are they of one sequence and clock?")

@@ -362,6 +362,14 @@ def test_keyframes_and_other_clocks_are_compared_too(loop, early_mistake):
     assert found[0].sim3.ate_m.rmse < 0.01
 
 
+def test_a_frame_between_two_common_ones_costs_neither(loop):
+    """Every frame of a trajectory that begins early, beside every second one with jitter of its stamps."""
+    whole = replace(loop, stamps_s=loop.stamps_s + 0.002 * (np.arange(len(loop)) % 3))
+    half = whole.take(slice(61, None, 2))
+    found = score_common(loop, [("whole", whole.take(slice(0, len(half)))), ("half", half)])
+    assert [s.sim3.matched for s in found] == [5, 5]
+
+
 def test_runs_with_nothing_in_common_are_named(loop):
     with pytest.raises(EvaluationError, match="a, b: 0 frame"):
         score_common(loop, [("a", loop.take(slice(0, 50))), ("b", loop.take(slice(100, 150)))])
