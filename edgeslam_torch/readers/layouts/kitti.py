@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 
 from edgeslam_torch.errors import CalibrationError
+from edgeslam_torch.files.tables import read_text
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.images import image_files, usual_size
 from edgeslam_torch.readers.listing import ImageEntry, Problem, image_times, in_order, read_times
@@ -52,7 +53,7 @@ def _camera(path: Path, matrix: str, images: list[ImageEntry]) -> Camera | None:
     """Rectified pinhole camera from the line ``P2: fx 0 cx tx 0 fy cy ty 0 0 1 tz``; None without the file."""
     if not path.is_file() or not images:
         return None
-    lines = dict(line.split(":", 1) for line in path.read_text(encoding="utf-8").splitlines() if ":" in line)
+    lines = dict(line.split(":", 1) for line in read_text(path, CalibrationError).splitlines() if ":" in line)
     try:
         p = [float(word) for word in lines[matrix].split()]
         fx, cx, fy, cy = p[0], p[2], p[5], p[6]
