@@ -199,9 +199,14 @@ def run(
         atlas: Map to load and file to save the map to; none by default.
 
     Raises:
+        TypeError: If it is no source, or no settings.
         OutputError: If the folder is not writable, contains files that no run wrote, or is in use by another run.
         SourceError: If the source provides no frame, or fails during the run (after the results are written).
     """
+    if not hasattr(source, "frames"):
+        raise TypeError(f"a source is expected, got {type(source).__name__}: open_source(PATH)")
+    if config is not None and not isinstance(config, SlamConfig):
+        raise TypeError(f"a SlamConfig is expected, got {type(config).__name__}")
     config, atlas = config or SlamConfig(), atlas or AtlasFiles()
     with closing(source), closing(RunWriter(Path(out_dir), [Path(source.location)], to_toml(config))) as writer:
         slam = (make_slam or partial(_edge_slam, imu=source.imu))(source.camera, config, mode is Mode.REALTIME)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from edgeslam_torch import Camera, EdgeSlam, Frame, SlamConfig, TelemetrySample
+from edgeslam_torch import Camera, EdgeSlam, Frame, SlamConfig, TelemetrySample, run
 from edgeslam_torch.config import DepthConfig
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.source import open_source
@@ -71,6 +71,20 @@ def test_what_is_no_telemetry_is_refused_at_once(telemetry):
     slam = EdgeSlam(CAMERA, NO_NETWORK)
     with pytest.raises((TypeError, ValueError), match="telemetry|readings"):
         slam.step(BGR, telemetry)
+
+
+@pytest.mark.parametrize("source", ["recordings/fr1", None, {"path": "recordings/fr1"}])
+def test_what_is_no_source_is_refused_before_anything_is_written(tmp_path, source):
+    with pytest.raises(TypeError, match=r"a source is expected, got \w+: open_source\("):
+        run(source, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_settings_that_are_none_are_refused_before_anything_is_written(tmp_path, write_tum):
+    write_tum(tmp_path / "recording", 3)
+    with pytest.raises(TypeError, match="a SlamConfig is expected, got dict"):
+        run(open_source(tmp_path / "recording"), tmp_path / "out", {"orb": {}})
+    assert not (tmp_path / "out").exists()
 
 
 def test_steps_pair_each_frame_with_the_telemetry_since_the_last(tmp_path, write_images):
