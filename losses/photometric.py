@@ -163,7 +163,7 @@ class SmoothnessLoss(nn.Module):
             n = contrast.shape[dim] - 1
             weight = torch.exp(-10.0 * torch.maximum(contrast.narrow(dim, 0, n), contrast.narrow(dim, 1, n)))
             known = seen.narrow(dim, 0, n) & seen.narrow(dim, 1, n) & seen.narrow(dim, 2, n)
-            total = total + masked_mean(bend * weight, known)
+            total = total + masked_mean(bend.where(known, 0.0) * weight, known)
         return total
 
     if TYPE_CHECKING:

@@ -24,8 +24,11 @@ def count_operations(model: onnx.ModelProto) -> Operations:
     """Count the convolutions of a network of fixed size.
 
     Raises:
-        ValueError: If a size is open, so that there is no number.
+        ValueError: If there is no number: a size is open, or there are functions, which may call each other so often
+            that they never end.
     """
+    if model.functions:
+        raise ValueError("what its functions compute is not counted: export them inlined to count")
     graph = onnx.shape_inference.infer_shapes(model).graph
     shapes = {value.name: _shape(value) for value in (*graph.value_info, *graph.output)}
     stored = {tensor.name: tensor for tensor in graph.initializer}

@@ -65,3 +65,16 @@ def test_smoothness_ignores_slopes_and_bends_at_contrast():
     step = (torch.arange(8) > 3).float().expand(1, 1, 8, 8)
     edge = (torch.arange(8) > 3).float().expand(1, 3, 8, 8)
     assert SmoothnessLoss()(step, edge).item() < 0.01 * SmoothnessLoss()(step, flat).item()
+
+
+def test_a_depth_that_is_lost_under_a_hole_leaves_no_gradient():
+    image = torch.full((1, 3, 8, 8), 0.5).requires_grad_()
+    log_depth = torch.zeros(1, 1, 8, 8)
+    hole = torch.zeros(8, 8, dtype=torch.bool)
+    hole[3, 3] = True
+    log_depth = log_depth.masked_fill(hole, torch.nan).requires_grad_()
+    seen = image.masked_fill(hole, torch.nan)
+    loss = SmoothnessLoss()(log_depth, seen)
+    loss.backward()
+    assert loss.item() == 0
+    assert log_depth.grad.isfinite().all() and image.grad.isfinite().all()

@@ -47,3 +47,20 @@ def test_weights_in_constant_nodes_count_alike():
 def test_open_size_has_no_number():
     with pytest.raises(ValueError, match="size of out is open"):
         count_operations(network(False, "width"))
+
+
+@pytest.mark.parametrize("called", ["f25", "f26"])
+def test_functions_that_call_each_other_endlessly_have_no_number(called):
+    model = network(False)
+    opsets = [helper.make_opsetid("", 18), helper.make_opsetid("own", 1)]
+    calls = [("Identity",), *((f"f{i}", f"f{i}") for i in range(25)), (called, called)]
+    for i, names in enumerate(calls):
+        nodes = [
+            helper.make_node(name, [f"t{j}"], [f"t{j + 1}"], domain="" if name == "Identity" else "own")
+            for j, name in enumerate(names)
+        ]
+        model.functions.append(helper.make_function("own", f"f{i}", ["t0"], [f"t{len(names)}"], nodes, opsets))
+    model.opset_import.append(opsets[1])
+    model.graph.node.append(helper.make_node("f26", ["out"], ["end"], domain="own"))
+    with pytest.raises(ValueError, match="functions"):
+        count_operations(model)
