@@ -12,6 +12,7 @@ from typing import Any
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.extras import needs_extra
+from edgeslam_torch.files.time_units import MAX_STAMP_S
 from edgeslam_torch.readers.bags.limits import check_definition_text, check_types, readers
 from edgeslam_torch.readers.bags.mcap_file import McapFile, profile
 
@@ -127,8 +128,8 @@ class Bag:
                 wanted = [c for c in reader.connections if c.topic in names and c.msgtype == known[c.topic][0]]
                 for connection, received_ns, data in reader.messages(wanted) if wanted else ():
                     received_s = 1e-9 * received_ns
-                    if not math.isfinite(received_s):
-                        raise ValueError("a receive time that is not a number")
+                    if not abs(received_s) <= MAX_STAMP_S:
+                        raise ValueError("a receive time that cannot be one")
                     yield Raw(connection.topic, received_s, data)
 
     def first(self, name: str, count: int) -> list[tuple[Raw, Any]]:

@@ -117,6 +117,7 @@ ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n)"
         "UPDATE topics SET type = 5",
         "UPDATE topics SET name = x'00ff', type = x'00'",
         "UPDATE messages SET timestamp = 9e999",
+        "UPDATE messages SET timestamp = 1e300 WHERE id > 1",
         "UPDATE messages SET timestamp = 'soon'",
         "UPDATE messages SET timestamp = x'00'",
         "UPDATE messages SET data = 'text'",
