@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from edgeslam_torch.models.record import Metadata
+    from edgeslam_torch.terminal.progress import Progress
     from edgeslam_torch.types import FloatArray
 
 HELP = "export the depth network to ONNX (float32, float16 or int8)"
@@ -49,6 +50,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Export, compare with torch on real frames, print the table."""
+    from edgeslam_torch.terminal.progress import Progress
+
+    with Progress("loading") as progress:
+        return _export(args, progress)
+
+
+def _export(args: argparse.Namespace, progress: "Progress") -> int:
     with needs_extra("export", "edgeslam export"):
         importlib.import_module("onnxscript")  # torch loads it when it exports, and fails in many words
     from edgeslam_torch.frontend.depth_network import weights_path
@@ -56,13 +64,12 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.models.onnx.export import OLD_RUNTIME_OPSET, ExportOptions, export_onnx
     from edgeslam_torch.models.onnx.fold import deployed
     from edgeslam_torch.models.onnx.quantize import MIN_CALIBRATION_IMAGES, quantize_int8, store_float16
+    from edgeslam_torch.terminal.progress import counted
 
     if args.int8 and args.fp16:
         raise ConfigError("--int8 and --fp16 exclude each other")
     if args.int8 and args.calibrate is None:
         raise ConfigError("--int8 needs --calibrate DATA: real frames like those the network will see")
-    from edgeslam_torch.terminal.progress import Progress, counted
-
     network, metadata = load_checkpoint(weights_path(args.depth))
     height, width = _size(args.size, metadata)
     opset = _opset(min(args.opset, OLD_RUNTIME_OPSET) if args.old_runtime else args.opset)
@@ -71,7 +78,8 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError(f"{args.calibrate}: --int8 needs {MIN_CALIBRATION_IMAGES} images, there are {len(images)}")
     try:
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory() as folder, Progress("exporting") as progress:
+        with TemporaryDirectory() as folder:
+            progress.phase("exporting")
             plain = Path(folder) / "float32.onnx"
             options = ExportOptions(height, width, opset, args.dynamic_size, args.dynamic_batch)
             export_onnx(network, metadata, plain, options)

@@ -32,10 +32,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Write each report, and the comparison of two; print their paths."""
-    from edgeslam_torch.eval.report.page import write_report
+    from edgeslam_torch.terminal.progress import Progress
 
     if args.out is not None and len(args.runs) != 2:
         raise ConfigError(f"--out is for the comparison of two runs, got {len(args.runs)}")
+    with Progress("making the report"):
+        return _write(args)
+
+
+def _write(args: argparse.Namespace) -> int:
+    from edgeslam_torch.eval.report.page import write_report
+
     for run in args.runs:
         if len(args.runs) == 2 and run.is_file():
             continue  # a trajectory alone has no report, but can be compared

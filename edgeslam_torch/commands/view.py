@@ -24,17 +24,24 @@ def main(args: argparse.Namespace) -> int:
     """Open the page, writing it first if missing; without a browser, print its path."""
     if args.viewer or args.save_rrd is not None:
         return _rerun(args)
-    from edgeslam_torch.eval.report.page import write_report
-
     page = args.run / "report.html"
     try:
-        page = page if page.is_file() else write_report(args.run)
+        page = page if page.is_file() else _written(args.run)
     except OSError as error:
         raise OutputError(f"{page}: cannot be written ({error.strerror or error})") from error
     print(page.resolve())
     if not args.only_print and not webbrowser.open(page.resolve().as_uri()):
         print("no browser here: copy the page to a machine with one; it is self-contained")
     return 0
+
+
+def _written(run: Path) -> Path:
+    from edgeslam_torch.terminal.progress import Progress
+
+    with Progress("making the report"):
+        from edgeslam_torch.eval.report.page import write_report
+
+        return write_report(run)
 
 
 def _rerun(args: argparse.Namespace) -> int:

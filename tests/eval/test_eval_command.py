@@ -9,11 +9,13 @@ from markdown_rows import row, rows
 from summaries import with_summary
 
 from edgeslam_torch.commands import report as report_command
+from edgeslam_torch.commands import view as view_command
 from edgeslam_torch.commands.judging import compare as compare_command
 from edgeslam_torch.commands.judging import eval as eval_command
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
 from edgeslam_torch.eval.metrics.run_score import evaluate_run
+from edgeslam_torch.terminal.progress import Progress
 
 
 def run(module, *words):
@@ -153,6 +155,17 @@ def test_wrong_folders_get_one_line(what, run_folder, tmp_path):
         else:
             run(eval_command, tmp_path / "a", "--groundtruth", tmp_path / "empty")
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize("command", [report_command, view_command, compare_command, eval_command])
+def test_what_scores_maps_says_so_from_the_first_second(run_folder, tmp_path, monkeypatch, command):
+    own_recording(tmp_path / "a", run_folder(tmp_path / "a"))
+    begun = []
+    begin = Progress._begin
+    monkeypatch.setattr(Progress, "_begin", lambda self, what, *rest: (begun.append(what), begin(self, what, *rest)))
+    words = {compare_command: [tmp_path / "a"], view_command: ["--print"]}.get(command, [])
+    assert run(command, tmp_path / "a", *words) == 0
+    assert begun and begun[0] in ("making the report", "judging trajectories and maps")
 
 
 def test_report_says_how_the_run_went(run_folder, tmp_path):

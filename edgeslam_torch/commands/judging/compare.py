@@ -33,11 +33,13 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.eval.metrics.run_score import evaluate_run
     from edgeslam_torch.eval.metrics.trajectory_error import score_common
     from edgeslam_torch.eval.report.tables import common_report, report_of_two
+    from edgeslam_torch.terminal.progress import counted
 
     both = (args.first, args.second)
     known = [truth for run in both if (truth := args.groundtruth or open_run(run).own_truth) is not None]
     truth = one_groundtruth(known or [groundtruth_of(args.first, None)])
-    first, second = (evaluate_run(run, truth, max_dt_s=args.max_dt, offset_s=args.offset) for run in both)
+    shown = counted(both, "judging trajectories and maps", "run")
+    first, second = (evaluate_run(run, truth, max_dt_s=args.max_dt, offset_s=args.offset) for run in shown)
     names = zip("AB", both, strict=True)
     common = score_common(
         read_trajectory(truth), [(name, read_trajectory(run)) for name, run in names], args.max_dt, args.offset
