@@ -13,8 +13,8 @@ from types import ModuleType
 
 from edgeslam_torch import __version__
 from edgeslam_torch.errors import EdgeSlamError, SourceError
-from edgeslam_torch.files.output_file import add_overwrite, check_outputs
-from edgeslam_torch.help.pages import described, listing
+from edgeslam_torch.files.output_file import add_overwrite, check_outputs, parsers_of
+from edgeslam_torch.help.pages import describe_verbs, described, listing
 from edgeslam_torch.help.parser import EXIT_USAGE, Parser
 from edgeslam_torch.terminal.console import console, exit_code
 
@@ -72,7 +72,7 @@ def _run_command(arguments: list[str], commands: Commands) -> int:
 def _call(name: str, entry: tuple[str, str], arguments: list[str], verbose: bool) -> int:
     module = importlib.import_module(entry[0])
     parser = Parser(prog=f"edgeslam {name}", **described(name, module.__doc__ or entry[1]))
-    _add_arguments(parser, module)
+    _add_arguments(name, parser, module)
     args, unknown = parser.parse_known_args(arguments)
     if unknown:
         parser.error(_unknown_arguments(unknown, parser.options()))
@@ -98,11 +98,13 @@ def _check_plain(args: argparse.Namespace) -> None:
                             raise SourceError(f"{name}: is neither a regular file nor a folder")
 
 
-def _add_arguments(parser: Parser, module: ModuleType) -> None:
+def _add_arguments(name: str, parser: Parser, module: ModuleType) -> None:
     module.add_arguments(parser)
+    describe_verbs(name, parser)
     add_overwrite(parser)
-    if "--verbose" not in parser.options():
-        parser.add_argument("-v", "--verbose", action="store_true", help="debug messages, and tracebacks of errors")
+    for each in parsers_of(parser):
+        if "--verbose" not in each._option_string_actions:
+            each.add_argument("-v", "--verbose", action="store_true", help="debug messages, and tracebacks of errors")
 
 
 def full_parser(commands: Commands) -> Parser:
@@ -111,7 +113,8 @@ def full_parser(commands: Commands) -> Parser:
     below = parser.add_subparsers(metavar="COMMAND")
     for name, entry in commands.items():
         module = importlib.import_module(entry[0])
-        _add_arguments(below.add_parser(name, help=entry[1], **described(name, module.__doc__ or entry[1])), module)
+        command = below.add_parser(name, help=entry[1], **described(name, module.__doc__ or entry[1]))
+        _add_arguments(name, command, module)
     return parser
 
 

@@ -138,6 +138,19 @@ def test_every_command_has_a_group_and_examples_that_parse():
         assert all(line in commands[name].format_help() for line in lines)
 
 
+@pytest.mark.parametrize("command", ["fly", "data", "weights"])
+def test_a_verb_has_its_description_its_own_examples_and_the_options_of_all_commands(command):
+    def choices(parser):
+        return next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+
+    verbs = choices(choices(full_parser(cli.available())).choices[command])
+    for verb in verbs._choices_actions:
+        text, examples = verbs.choices[verb.dest].format_help().split("examples:\n")
+        assert verb.help in " ".join(text.split()) and "--verbose" in text
+        lines = [line.split() for line in examples.splitlines()]
+        assert lines and all(words[:3] == ["edgeslam", command, verb.dest] for words in lines)
+
+
 def test_ctrl_c_while_loops_compile_is_not_lost():
     """LLVM calls Python while it compiles, and drops what that raises."""
     code = """

@@ -34,7 +34,7 @@ def output_file(text: str) -> Path:
 
 def add_overwrite(parser: argparse.ArgumentParser) -> None:
     """Declare ``--overwrite`` where a file to write can be named."""
-    for each in _parsers(parser):
+    for each in parsers_of(parser):
         if any(action.type is output_file for action in each._actions):
             add_overwrite_to(each)
 
@@ -51,7 +51,7 @@ def check_outputs(parser: argparse.ArgumentParser, args: argparse.Namespace) -> 
     Raises:
         OutputError: If one exists and may not be replaced.
     """
-    actions = {a.dest: a for each in _parsers(parser) for a in each._actions if a.type is output_file}
+    actions = {a.dest: a for each in parsers_of(parser) for a in each._actions if a.type is output_file}
     read = [path for name, value in vars(args).items() if name not in (*actions, "out") for path in _paths(value)]
     named: list[Path] = []
     for dest, action in actions.items():
@@ -107,13 +107,13 @@ def check_new(path: Path, overwrite: bool, option: str = "--out") -> None:
         raise OutputError(f"{path}: exists; give another file to {option}, or --overwrite to replace it")
 
 
-def _parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """The parser, and those of its actions."""
+def parsers_of(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """The parser, and those of its verbs."""
     yield parser
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for inner in action.choices.values():
-                yield from _parsers(inner)
+                yield from parsers_of(inner)
 
 
 def _paths(value: Any) -> Iterator[str | Path]:

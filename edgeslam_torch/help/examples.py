@@ -31,6 +31,9 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "fly": (
         "edgeslam fly home --fly",
         "edgeslam fly goto 3 0 --drone sim://rooms:1 --fly",
+        "edgeslam fly explore 120 --fly --back",
+        "edgeslam fly corridor --fly --record flights/today",
+        "edgeslam fly exit 90 --drone sim://rooms:1 --fly",
         "edgeslam fly replay flights/today",
     ),
     "sim": ("edgeslam sim", "edgeslam sim --world rooms --wind 0.5 --loss 2"),
@@ -52,7 +55,12 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "edgeslam export -o depth.onnx --int8 --calibrate recording/",
         "edgeslam export --depth mine.safetensors -o mine.onnx",
     ),
-    "weights": ("edgeslam weights list", "edgeslam weights inspect mine.safetensors"),
+    "weights": (
+        "edgeslam weights list",
+        "edgeslam weights download mobilenet-nnconv5dw-skipadd",
+        "edgeslam weights convert mobilenet-nnconv5dw-skipadd.pth.tar -o fastdepth.safetensors",
+        "edgeslam weights inspect mine.safetensors",
+    ),
     "eval": (
         "edgeslam eval runs/flight",
         "edgeslam eval runs/a orbslam.txt -g recording/ --common-frames --plots pictures",
