@@ -9,7 +9,6 @@ import numpy as np
 import onnx
 from google.protobuf.message import DecodeError
 from onnx import TensorProto, numpy_helper
-from onnx.external_data_helper import load_external_data_for_tensor
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.layout import INPUT_MULTIPLE
@@ -77,6 +76,7 @@ def _brought_in(model: onnx.ModelProto, path: Path) -> bool:
     """Read the numbers that lie in other files of the same folder into the model; whether there were any."""
     outside = [t for t in _constants(model.graph) if t.data_location == TensorProto.EXTERNAL]
     total = path.stat().st_size
+    places = []
     for tensor in outside:
         entry = {part.key: part.value for part in tensor.external_data}
         name = entry.get("location", "")
@@ -86,11 +86,18 @@ def _brought_in(model: onnx.ModelProto, path: Path) -> bool:
             raise WeightsError(f"its numbers are to lie in {name!r} beside it, and no such file is there; copy it too")
         with open_weights(path.parent / name) as opened:
             whole = opened.seek(0, os.SEEK_END)
-        total += int(entry.get("length", whole))
+        offset = int(entry.get("offset", 0))
+        length = int(entry.get("length", whole - offset))
+        if not (offset >= 0 and 0 <= length <= whole - offset):
+            raise WeightsError(f"{tensor.name} is to lie in {name!r} where that file has ended; copy it again")
+        total += length
+        places.append((name, offset, length))
     if total > MAX_FILE_BYTES:
         raise WeightsError(f"{total >> 20} MiB with its data, more than any network that is read here")
-    for tensor in outside:
-        load_external_data_for_tensor(tensor, str(path.parent))
+    for tensor, (name, offset, length) in zip(outside, places, strict=True):
+        with open_weights(path.parent / name) as opened:  # also a link, as caches of downloads make them
+            opened.seek(offset)
+            tensor.raw_data = opened.read(length)
         tensor.data_location = TensorProto.DEFAULT
         del tensor.external_data[:]
     return bool(outside)

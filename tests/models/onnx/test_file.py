@@ -79,6 +79,19 @@ def test_numbers_beside_the_file_are_read_and_missed_by_name(whole, tmp_path):
         parse_onnx(tmp_path / "w.onnx")
 
 
+def test_numbers_behind_a_link_are_read_as_caches_of_downloads_keep_them(whole, tmp_path):
+    model = onnx.load_model_from_string(whole)
+    onnx.save(model, str(tmp_path / "w.onnx"), save_as_external_data=True, location="w.data", size_threshold=0)
+    (tmp_path / "w.data").rename(tmp_path / "0f3a")
+    (tmp_path / "w.data").symlink_to("0f3a")
+    read = parse_onnx(tmp_path / "w.onnx").model.graph.initializer
+    for tensor, exact in zip(read, onnx.load_model_from_string(whole).graph.initializer, strict=True):
+        np.testing.assert_array_equal(numpy_helper.to_array(tensor), numpy_helper.to_array(exact))
+    (tmp_path / "0f3a").write_bytes((tmp_path / "0f3a").read_bytes()[:-1])
+    with pytest.raises(WeightsError, match=r"w\.onnx: .*w\.data"):
+        parse_onnx(tmp_path / "w.onnx")
+
+
 @pytest.mark.parametrize(
     "change",
     [
