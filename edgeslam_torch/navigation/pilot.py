@@ -148,7 +148,9 @@ class Pilot:
             self._forget()
         self._revision, self._revised_s = state.revision, state.stamp_s
         self._check_submap(state)
-        if self._at_take_off:
+        # Metres of the clear area, known before those of the map: a correction of the scale has changed them with it.
+        over_take_off = float(np.linalg.norm(state.p_w[:2])) < TAKE_OFF_M
+        if self._at_take_off or (corrected and over_take_off):
             self._at_take_off = False
             for z in np.arange(0.1, self.limits.height_m + TAKE_OFF_M, 0.2):
                 self.space.flown(np.array([*state.p_w[:2], z]), TAKE_OFF_M)

@@ -12,6 +12,7 @@ from edgeslam_torch.navigation.arcs import candidates, flown
 from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.map_views import MapUpdate
 from edgeslam_torch.navigation.pilot import Phase, Pilot
 from edgeslam_torch.navigation.route import cost_to_go
 from edgeslam_torch.navigation.skills.explore import Explore
@@ -377,6 +378,19 @@ def test_map_correction_is_no_progress():
         after[0, 3] = 0.1 * (k % 2 == 0)
         pilot.update(replace(at(after[0, 3], 0.0, stamp_s=0.5 * k), map_update=moved(99, after.copy()) if k else None))
     assert not pilot.space.layer(1.15, 0.15).solid.any()
+
+
+def test_the_clear_area_of_the_take_off_is_in_metres():
+    """Also where the first map's unit was two and a half times too long."""
+    pilot, T_w_c = Pilot(GoTo(np.array([5.0, 0.0, 1.15]))), np.eye(4)
+    T_w_c[2, 3] = 1.15
+    pilot.update(replace(at(0.0, 0.0), p_w=np.array([0.0, 0.0, 1.15 / 0.4]), view=facing_a_wall()))
+    picture = facing_a_wall().picture
+    update = MapUpdate(np.array([picture]), T_w_c[None], 0.4)
+    pilot.update(replace(at(0.0, 0.0, stamp_s=1.0), revision=1, map_update=update))
+    layer = pilot.walls().layer
+    behind = 0.4 * np.array([[-1.0, 0.0], [-0.7, -0.7], [0.0, -1.0], [0.0, 1.0], [-0.7, 0.7]])
+    assert layer.free[tuple(layer.cells(behind).T)].all()
 
 
 @pytest.mark.parametrize(("apart_m", "forgotten"), [(0.1, False), (0.13, True)])
