@@ -21,7 +21,7 @@ from edgeslam_torch.compiled import compile_all
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.estimation.motion import MotionFusion
-from edgeslam_torch.estimation.output_frame import OutputFrame, first_pose
+from edgeslam_torch.estimation.output_frame import first_pose
 from edgeslam_torch.estimation.snapshot import Present
 from edgeslam_torch.frontend.depth_check import CheckedDepth, DepthFunction
 from edgeslam_torch.frontend.edges import extract_edges
@@ -317,7 +317,7 @@ class EdgeSlam:
         estimate = self.scale
         if np.isfinite(estimate.sigma):
             before = self._system.published
-            self._system.published = OutputFrame(estimate.value, before.R, upright=before.upright)
+            self._system.published = replace(before, scale=estimate.value)
         self._find_up()
         self._calibration_warning = calibration_warning(self.camera, self._shown_keyframes(), self.map.anchors.p_w)
 

@@ -210,8 +210,9 @@ class MotionFusion:
 
     def republished(self, published: OutputFrame) -> OutputFrame:
         """The published frame, levelled and with the present scale."""
-        upright = self.orientation.upright()
-        return published.turned_upright(self.imu.upright() if upright is None else upright).revised(self.scale())
+        upright, by_imu = self.orientation.upright(), self.imu.upright()
+        validated = self._trust.turns if upright is not None else by_imu is not None
+        return published.turned_upright(by_imu if upright is None else upright, validated).revised(self.scale())
 
     def present(
         self, stamp_s: float, state: str, published: OutputFrame, submap_sigma: float = 0.0, drift_sigma: float = 0.0

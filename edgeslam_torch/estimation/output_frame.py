@@ -2,7 +2,8 @@
 
 The map itself is never rescaled. Its units are published as they are until reliable sensors contradict them. A revision
 rescales about the origin, where the flight began: positions after it are right at once, and those published before
-carry the revision of their unit. A map that began before the attitude was known is levelled once, likewise. Final
+carry the revision of their unit. The axes are revised likewise: once the attitude is known, and again where a validated
+one finds them off, as after a bent take-off. Final
 results without telemetry are levelled by `mapping/level/`.
 """
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.rotations import matrix_from_rpy, smallest_rotation
+from edgeslam_torch.noise import FIRST_ATTITUDE_RAD
 from edgeslam_torch.types import FloatArray, PointCloud, ScaleEstimate
 
 T_LEVEL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -29,6 +31,9 @@ _IMPROVED = 0.5
 """Share of the published scale's sigma at which an estimate replaces it if it is off by more than the new sigma. The
 initial guess has an infinite one; an IMU's first estimate is good to a half, and to a hundredth ten seconds later."""
 
+_LEANS_RAD = 2.0 * FIRST_ATTITUDE_RAD
+"""Error of levelled axes that is corrected: two standard deviations of the attitude that levelled them."""
+
 MEASURED = frozenset({"telemetry", "height", "imu"})
 """Sources that measure metres; the depth network has set the initial guess already."""
 
@@ -44,7 +49,9 @@ class OutputFrame:
     sigma: float = math.inf
     """Relative standard deviation of the scale at its last revision; infinite for the initial guess."""
     upright: bool = False
-    """Whether the axes are final: z up by the drone's attitude, or those of an earlier flight."""
+    """Whether z is up by the drone's attitude."""
+    is_earlier: bool = False
+    """Whether scale and axes are those of an earlier flight, which stay."""
 
     def pose(self, T_w_c: FloatArray) -> FloatArray:
         """Poses ``(..., 4, 4)`` of the map as published."""
@@ -75,13 +82,17 @@ class OutputFrame:
         """Deviation of the published scale from an estimate, in the logarithm."""
         return abs(math.log(estimate.value / self.scale))
 
-    def turned_upright(self, R_w_m: FloatArray | None) -> "OutputFrame":
+    def turned_upright(self, R_w_m: FloatArray | None, validated: bool) -> "OutputFrame":
         """The same with z up, by the smallest rotation, if it is not yet level and the attitude is known.
 
         Args:
             R_w_m: Rotation ``(3, 3)`` from the map to a world whose z is up; None while unknown.
+            validated: Whether it is known well enough to correct axes that were levelled before.
         """
-        if self.upright or R_w_m is None:
+        if R_w_m is None or self.is_earlier:
+            return self
+        leans_rad = math.acos(min(float(self.R[2] @ R_w_m[2]), 1.0))
+        if self.upright and not (validated and leans_rad > _LEANS_RAD):
             return self
         return replace(self.levelled(R_w_m[2]), revision=self.revision + 1, upright=True)
 

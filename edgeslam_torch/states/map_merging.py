@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 from edgeslam_torch.atlas.atlas import Atlas, MapChange
-from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.states.system import System
 
@@ -38,10 +37,10 @@ class MapMerging:
         system.fusion.metres.remember(known)
         if known is None:
             return
-        published = replace(system.published, upright=True)
+        published = replace(system.published, upright=True, is_earlier=True)
         if published.scale != known.value or not np.array_equal(published.R, np.eye(3)):
             sigma = known.sigma / known.value
-            published = OutputFrame(known.value, revision=published.revision + 1, sigma=sigma, upright=True)
+            published = replace(published, scale=known.value, R=np.eye(3), revision=published.revision + 1, sigma=sigma)
         system.published = published
 
     def finish(self) -> None:

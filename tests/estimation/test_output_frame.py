@@ -1,5 +1,7 @@
 """The published world: z up, metres when known, right at once when the scale changes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from point_map import small_motion
@@ -54,7 +56,7 @@ def test_a_scale_is_revised_by_a_much_better_or_a_contradicting_one(value, sigma
 def test_a_map_is_turned_upright_once(rng):
     old = OutputFrame(1.5, small_motion(rng, 0, 1.0)[:3, :3], revision=2)
     R_w_m = small_motion(rng, 0, 1.0)[:3, :3]
-    new = old.turned_upright(R_w_m)
+    new = old.turned_upright(R_w_m, False)
     assert (new.revision, new.scale, new.upright) == (3, 1.5, True)
     up_m = R_w_m.T @ [0.0, 0.0, 1.0]
     np.testing.assert_allclose(new.R @ up_m, [0.0, 0.0, 1.0], atol=1e-12)
@@ -62,8 +64,20 @@ def test_a_map_is_turned_upright_once(rng):
     assert np.arccos((np.trace(turn) - 1.0) / 2.0) == pytest.approx(np.arccos((old.R @ up_m)[2])), (
         "by no more than that"
     )
-    assert new.turned_upright(small_motion(rng, 0, 1.0)[:3, :3]) is new
-    assert old.turned_upright(None) is old
+    assert new.turned_upright(small_motion(rng, 0, 1.0)[:3, :3], False) is new
+    assert old.turned_upright(None, True) is old
+
+
+@pytest.mark.parametrize(("leans_deg", "revised"), [(1.0, False), (4.0, True), (-4.0, True)])
+def test_a_validated_attitude_levels_a_map_again_where_it_leans_clearly(leans_deg, revised):
+    old = OutputFrame(0.7, upright=True, revision=3)
+    R_w_m = se3.exp(np.array([0, 0, 0, 0, np.deg2rad(leans_deg), 0]))[:3, :3]
+    assert old.turned_upright(R_w_m, False) is old, "not validated"
+    assert replace(old, is_earlier=True).turned_upright(R_w_m, True).revision == 3, "an earlier flight's axes stay"
+    new = old.turned_upright(R_w_m, True)
+    assert new.revision == 3 + revised
+    if revised:
+        np.testing.assert_allclose(new.R @ R_w_m[2], [0.0, 0.0, 1.0], atol=1e-9)
 
 
 @pytest.mark.parametrize(("value", "sigma", "published"), [(5.0, 0.25, 4.4), (0.2, 0.02, 0.22)])

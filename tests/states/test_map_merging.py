@@ -150,10 +150,10 @@ def test_the_axes_of_an_earlier_flight_apply_in_its_map(rng, turned):
     T_k_w, motion = moving(rng)
     system = system_of(Pieces(T_k_w), motion)
     R_w_m = se3.exp(np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0]))[:3, :3]
-    system.published = OutputFrame(1.0).turned_upright(R_w_m if turned else None)
+    system.published = OutputFrame(1.0).turned_upright(R_w_m if turned else None, True)
     atlas = system.map.atlas(moved=1)
     atlas.known_scale[0] = ScaleEstimate(1.0, 0.02, "depth")
     MapMerging(system, atlas).enter(0)
     np.testing.assert_array_equal(system.published.R, np.eye(3))
     assert system.published.revision == 2 * int(turned)
-    assert system.published.turned_upright(R_w_m) is system.published
+    assert system.published.turned_upright(R_w_m, True) is system.published
