@@ -1,7 +1,8 @@
 """Files that the user names for a command to write: nothing is replaced without --overwrite.
 
 One rule for every command: what exists is replaced with ``--overwrite`` alone, and what the command reads never, by
-whatever name or hard link it is given. Folders of runs have a rule of their own, `edgeslam_torch.writers.own_folder`.
+whatever name or hard link it is given; nothing is added to a recording. Folders have a rule of their own,
+`edgeslam_torch.writers.own_folder`.
 """
 
 import argparse
@@ -14,6 +15,8 @@ from typing import Any
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.record_files import read_mapping, recording_of
 
+RECORDING = ("rgb.txt", "rgb", "mav0", "cam0", "data.csv", "sensor.yaml", "ost.yaml", "telemetry.csv")
+"""Names that only files and folders of recordings have."""
 _PARTS = re.compile(
     r"trajectory.*\.txt|status\.csv|summary\.json|(edge_map|anchors)\.ply|observations\.npz"
     r"|(rgb|depth|times|groundtruth|accelerometer)\.txt|(telemetry|imu|data)\.csv|(camera|imu|sensor|metadata)\.yaml"
@@ -68,7 +71,7 @@ def check_outputs(parser: argparse.ArgumentParser, args: argparse.Namespace) -> 
 
 
 def check_not_read(path: Path, read: Sequence[str | Path], option: str, made: bool = False) -> None:
-    """Check that a file to write is none of those read, and no part of a run or recording among them.
+    """Check that a file to write is none of those read, and would be no part of a recording, or of a run among them.
 
     Args:
         path: The file.
@@ -81,13 +84,14 @@ def check_not_read(path: Path, read: Sequence[str | Path], option: str, made: bo
     """
     read = [*read, *(recording for run in read if (recording := _recording_of(Path(run))) is not None)]
     places = [path]
-    if path.exists() and not made:
-        if _PICTURE.fullmatch(path.name):
-            places += path.parents
-        elif _PARTS.fullmatch(path.name):
-            places.append(path.parent)
+    is_picture = _PICTURE.fullmatch(path.name) is not None
+    is_part = not made and (is_picture or _PARTS.fullmatch(path.name) is not None)
+    if is_part:
+        places += path.parents if is_picture and path.exists() else [path.parent]
     if any(_same(place, other) for other in read for place in places):
-        raise OutputError(f"{path}: is what the command reads; give another file to {option}")
+        raise OutputError(f"{path}: is what the command reads, or part of it; give another file to {option}")
+    if is_part and (beside := next((name for name in RECORDING if (path.parent / name).exists()), None)):
+        raise OutputError(f"{path}: would lie beside {beside} of a recording; give another file to {option}")
 
 
 def check_new(path: Path, overwrite: bool, option: str = "--out") -> None:

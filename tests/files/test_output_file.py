@@ -44,6 +44,26 @@ def test_no_picture_or_bag_within_a_recording_is_replaced(parser, tmp_path, name
         _check(parser, tmp_path, "--json", path, "--overwrite")
 
 
+@pytest.mark.parametrize(
+    ("name", "is_free"),
+    [("new.mcap", False), ("new.bag", False), ("rgb.txt", False), ("7.png", False)]
+    + [("new.json", True), ("plots/7.png", True), ("made.yaml", True)],
+)
+def test_nothing_is_added_to_a_recording_that_is_read(parser, tmp_path, name, is_free):
+    """It would be read in place of the pictures, or as one of them."""
+    (tmp_path / "0.png").touch()
+    with nullcontext() if is_free else pytest.raises(OutputError):
+        _check(parser, tmp_path, "--json", tmp_path / name, "--overwrite")
+
+
+@pytest.mark.parametrize("mark", ["rgb.txt", "mav0"])
+def test_nothing_is_added_to_a_recording_that_is_not_read(parser, tmp_path, mark):
+    (tmp_path / mark).mkdir()
+    with pytest.raises(OutputError):
+        _check(parser, "in", "--json", tmp_path / "new.mcap")
+    _check(parser, "in", "--json", tmp_path / "new.json")
+
+
 @pytest.mark.parametrize("spelling", ["same", "relative", "symlink", "hard link"])
 def test_what_is_read_is_never_replaced(parser, tmp_path, monkeypatch, spelling):
     monkeypatch.chdir(tmp_path)
