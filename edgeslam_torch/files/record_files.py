@@ -3,7 +3,7 @@
 import json
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +86,14 @@ def read_mapping(path: Path, kind: str, error: type[EdgeSlamError]) -> dict[str,
     if not isinstance(record, dict):
         raise error(f"{path}: not a {kind} object")
     return record
+
+
+def is_record(path: Path, keys: Collection[str]) -> bool:
+    """Whether a file is a JSON object with these keys: what tells a result of ours from a file of others."""
+    try:
+        return read_mapping(path, "JSON", EdgeSlamError).keys() >= set(keys)
+    except EdgeSlamError:
+        return False
 
 
 def recording_of(run: Path, summary: Mapping[str, Any]) -> Path | None:

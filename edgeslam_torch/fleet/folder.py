@@ -16,6 +16,7 @@ from edgeslam_torch.eval.experiment.runner import Task
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.config_file import load_config, to_toml
 from edgeslam_torch.files.plain import subfolder
+from edgeslam_torch.files.record_files import is_record
 from edgeslam_torch.files.signature import signature
 from edgeslam_torch.fleet.manifest import Flight
 
@@ -69,11 +70,11 @@ class BatchFolder:
         self.path = path.resolve()
         self.path.mkdir(parents=True, exist_ok=True)
         names = {p.name for p in self.path.iterdir() if not p.name.startswith(".")}
-        if names and RECORD not in names:
+        if names and not _is_batch(self.path):
             raise OutputError(f"{path}: holds {min(names)}, which no batch wrote; give another folder to --out")
         for name in (FLIGHTS, JOBS, WORK, PICTURES):
             subfolder(self.path, name)
-        if RECORD not in names:
+        if not names:
             write_text(self.path / RECORD, "{}\n")
 
     def task(self, flight: Flight, settings: BatchSettings) -> FlightTask:
@@ -123,4 +124,4 @@ def is_beside_flights(path: Path) -> bool:
 
 
 def _is_batch(folder: Path) -> bool:
-    return (folder / RECORD).is_file() and (folder / FLIGHTS).is_dir()
+    return is_record(folder / RECORD, ()) and (folder / FLIGHTS).is_dir()

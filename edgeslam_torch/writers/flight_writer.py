@@ -1,6 +1,5 @@
 """Recording of a flight that is consistent at any moment, also after a crash."""
 
-import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -15,9 +14,11 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.telemetry_csv import TelemetryWriter
 from edgeslam_torch.types import Frame
+from edgeslam_torch.writers.own_folder import check_free
 
 _JPEG_QUALITY = 95
-_FILES = ("rgb.txt", "camera.yaml", "state.txt", "telemetry.csv")
+_FILES = ("camera.yaml", "state.txt", "moments.csv", "exits.csv", "plan.jsonl")
+"""Of recorded flights, beside those that mark a recording."""
 
 
 class FlightWriter:
@@ -31,17 +32,13 @@ class FlightWriter:
         """Make the folder.
 
         Raises:
-            OutputError: If it holds a recording or a run already or cannot be written.
+            OutputError: If it holds a recording or a run already, or cannot be written.
         """
         self.folder = folder
         self.frames = self.states = 0
         self._suffix = "png" if lossless else "jpg"
         self._options = [] if lossless else [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-        existing = next((name for name in _FILES if os.path.lexists(folder / name)), None)
-        if existing is None and (folder / "rgb").is_dir() and any((folder / "rgb").iterdir()):
-            existing = "rgb"
-        if existing is not None:
-            raise OutputError(f"{folder}: holds {existing} already, of a recording or a run; give another folder")
+        check_free(folder, _FILES, lambda _: False, "give another folder")
         try:
             subfolder(folder, "rgb")
             save_camera(folder / "camera.yaml", camera)

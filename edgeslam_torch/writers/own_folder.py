@@ -1,17 +1,22 @@
-"""Folders that a run may write into: empty ones or those of earlier runs, one run at a time."""
+"""Folders that a command may write into: without files of others, or of its own results; one run at a time.
+
+Results are known by their content (`is_run`, `edgeslam_torch.files.record_files.is_record`), never by their names.
+"""
 
 import errno
-import json
 import os
 import socket
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.output_file import RECORDING
 from edgeslam_torch.files.plain import open_plain, open_shared
+from edgeslam_torch.files.record_files import is_record
+from edgeslam_torch.readers.bags.bag import is_bag
 from edgeslam_torch.readers.images import image_files
 from edgeslam_torch.readers.layouts import layout_of
 from edgeslam_torch.readers.video import SUFFIXES as VIDEOS
@@ -26,8 +31,8 @@ SUMMARY = "summary.json"
 _STATUS_BEGIN = b"index,stamp_s,status,"
 """Header of the status table in every version; written with the first frame."""
 _SUMMARY_KEYS = frozenset({"version", "frames", "statuses"})
-_RECORDING = ("rgb.txt", "rgb", "mav0", "cam0", "data.csv", "sensor.yaml", "ost.yaml", "telemetry.csv")
-"""File names that only recordings have."""
+_FEW = 3
+"""Fewer pictures of others are no recording."""
 _LOCK = ".lock"
 _NOT_PLAIN = (errno.ELOOP, errno.EINVAL, errno.EISDIR, errno.ENXIO)
 """What opening a link, a pipe, a folder or a socket gives."""
@@ -35,33 +40,7 @@ _HOLDER = "process "
 """Beginning of its text."""
 
 
-def check_free(folder: Path, outputs: Collection[str], remedy: str = "give another folder to --out") -> None:
-    """Check that results named ``outputs`` may be written to the existing ``folder``.
-
-    Files of other names are ignored: a log, notes, a flight in a subfolder. ``remedy`` is for the message.
-
-    Raises:
-        OutputError: If a result would replace a file that no run wrote, or would lie among the files of a recording.
-    """
-    part = next((name for name in _RECORDING if (folder / name).exists()), None)
-    if part is None and not _is_run(folder):
-        part = _foreign(folder, outputs)
-    if part is not None:
-        raise OutputError(f"{folder}: holds {part}, which no run wrote; {remedy}")
-
-
-def _foreign(folder: Path, outputs: Collection[str]) -> str | None:
-    """A file that results would replace, or that marks a recording."""
-    name = next((name for name in outputs if (folder / name).exists()), None)
-    if name is not None:
-        return name
-    media = [*image_files(folder), *(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS)]
-    if media:
-        return media[0].name
-    return "a recording" if layout_of(folder) is not None else None
-
-
-def _is_run(folder: Path) -> bool:
+def is_run(folder: Path) -> bool:
     """Whether a run wrote here, including older versions and killed runs."""
     try:
         with open_plain(folder / STATUS) as file:
@@ -69,12 +48,70 @@ def _is_run(folder: Path) -> bool:
                 return True
     except OSError:
         pass
-    try:
-        with open_plain(folder / SUMMARY) as file:
-            summary = json.loads(file.read())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(summary, dict) and summary.keys() >= _SUMMARY_KEYS
+    return is_record(folder / SUMMARY, _SUMMARY_KEYS)
+
+
+def check_free(
+    folder: Path,
+    outputs: Collection[str],
+    is_ours: Callable[[Path], bool] = is_run,
+    remedy: str = "give another folder to --out",
+) -> None:
+    """Check that results named ``outputs`` may be written to a folder.
+
+    Files of other names are ignored: a log, notes, a flight in a subfolder.
+
+    Args:
+        folder: It may be missing.
+        outputs: Names of files and folders.
+        is_ours: Whether what a folder holds under these names may be replaced, since the same command wrote it.
+        remedy: For the message.
+
+    Raises:
+        OutputError: If a result would replace a file that no run wrote, or would lie among the files of a recording.
+    """
+    if not folder.is_dir():
+        return
+    part = next((name for name in RECORDING if (folder / name).exists()), None)
+    if part is None and not is_ours(folder):
+        part = _foreign(folder, outputs)
+    if part is not None:
+        raise OutputError(f"{folder}: holds {part}, which no run wrote; {remedy}")
+
+
+def check_pictures(folder: Path, is_ours: Callable[[Path], bool], remedy: str) -> None:
+    """Check that pictures may be added to a folder, which may be missing.
+
+    Args:
+        folder: The folder.
+        is_ours: Whether a picture in it is one of those that the same command writes.
+        remedy: For the message.
+
+    Raises:
+        OutputError: If a reader would take them for pictures of a recording there.
+    """
+
+    def is_free(folder: Path) -> bool:
+        return is_run(folder) or sum(not is_ours(path) for path in image_files(folder)) < _FEW
+
+    check_free(folder, (), is_free, remedy)
+
+
+def _foreign(folder: Path, outputs: Collection[str]) -> str | None:
+    """A file that results would replace, or that marks a recording."""
+    name = next((name for name in outputs if _is_there(folder / name)), None)
+    if name is not None:
+        return name
+    others = (p for p in folder.iterdir() if p.suffix.lower() in VIDEOS or (p.is_file() and is_bag(p)))
+    media = [*image_files(folder), *others]
+    if media:
+        return media[0].name
+    return "a recording" if layout_of(folder) is not None else None
+
+
+def _is_there(path: Path) -> bool:
+    """Whether there is more than an empty folder."""
+    return os.path.lexists(path) and not (path.is_dir() and not any(path.iterdir()))
 
 
 class FolderLock:

@@ -79,7 +79,7 @@ class RunWriter:
 
         Args:
             folder: Folder of the results.
-            keep: Folders that must not be written to, such as the source.
+            keep: Folders that must not be written to, such as the source, or files in such ones.
             config_toml: The resolved configuration, written beside the results.
 
         Raises:
@@ -93,7 +93,7 @@ class RunWriter:
         try:
             self._made = not folder.exists()
             folder.mkdir(parents=True, exist_ok=True)
-            if any(folder.samefile(other) for other in keep if other.exists()):
+            if any(folder.samefile(other.parent if other.is_file() else other) for other in keep if other.exists()):
                 raise OutputError(f"{folder}: is the source itself; give another folder to --out")
             check_free(folder, OUTPUTS)
             self._lock = FolderLock(folder)

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.eval.experiment.runner import Local
 from edgeslam_torch.fleet.batch import run_batch
 from edgeslam_torch.fleet.folder import BatchSettings
@@ -125,3 +125,15 @@ def test_mistake_in_one_flights_settings_is_found_before_any_is_run(tmp_path, re
     with pytest.raises(ConfigError, match=r"flights.csv, line 3: .*did you mean 'orb.features'"):
         batch(tmp_path, recordings, starter, manifest=manifest)
     assert starter.started == []
+
+
+@pytest.mark.parametrize("record", [None, "precious", "[]", '{"mine": 1}'])
+def test_no_batch_is_written_into_a_folder_of_others(tmp_path, recordings, record):
+    files = {"batch.csv": "precious"} | ({} if record is None else {"batch.json": record})
+    (tmp_path / "out").mkdir()
+    for name, text in files.items():
+        (tmp_path / "out" / name).write_text(text)
+    with pytest.raises(OutputError):
+        batch(tmp_path, recordings, starter := Starter())
+    assert starter.started == []
+    assert {path.name: path.read_text() for path in (tmp_path / "out").iterdir()} == files

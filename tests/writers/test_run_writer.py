@@ -187,6 +187,17 @@ def test_a_recording_of_any_layout_is_refused_but_a_run_that_keeps_images_is_non
     RunWriter(tmp_path / "run").close()
 
 
+def test_a_run_is_not_replaced_from_a_file_within(tmp_path):
+    """The camera that it is read with would be."""
+    leave_run(tmp_path)
+    (tmp_path / "run.mcap").touch()
+    before = contents(tmp_path)
+    with pytest.raises(OutputError):
+        RunWriter(tmp_path, [tmp_path / "run.mcap"])
+    assert contents(tmp_path) == before
+    RunWriter(tmp_path, [tmp_path.parent / "other.mcap"]).close()
+
+
 @pytest.mark.parametrize("left", [["status.csv", "config.toml"], ["summary.json", "camera.yaml"]])
 def test_what_is_left_of_a_run_is_known_as_a_run(tmp_path, left):
     leave_run(tmp_path / "run")

@@ -95,10 +95,11 @@ class ManyPictures:
         self.closed += 1
 
 
-def test_a_folder_that_cannot_be_written_leaves_the_drone_alone(address, tmp_path, capsys):
-    (tmp_path / "rgb.txt").write_text("")
+@pytest.mark.parametrize("name", ["rgb.txt", "moments.csv", "0.png"])
+def test_a_folder_that_cannot_be_written_leaves_the_drone_alone(address, tmp_path, capsys, name):
+    (tmp_path / name).write_text("")
     assert main(["run", address, "--record", str(tmp_path), "--out", str(tmp_path / "run")]) == 1
-    assert "holds rgb.txt already" in capsys.readouterr().err
+    assert name in capsys.readouterr().err
 
 
 def test_a_recording_is_not_recorded_again(tmp_path, capsys):
