@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,14 +21,17 @@ import numpy as np
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.conditions import code_state, machine, orb_pass_ms, stamp
 from edgeslam_torch.eval.experiment.figures import Figure, grouped, markdown_table
-from edgeslam_torch.eval.experiment.runner import MODULE, Local, Task, run_tasks
+from edgeslam_torch.eval.experiment.runner import MODULE, Local, Task, is_experiment, run_tasks
 from edgeslam_torch.eval.inputs.dataset import find_recordings
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.jobs.watched import Limits, start_module
+from edgeslam_torch.writers.own_folder import check_free
 
 FORMAT = 3
 """Of a record; earlier ones had no figure of CPU time in passes of ORB."""
+CASES = "cases"
+"""Folder of the cases' folders."""
 SYNTHETIC = "synthetic"
 """Name of the simulated flight among the sequences."""
 _RUN_TIMEOUT_S = 1800.0
@@ -102,7 +105,9 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
 
     Raises:
         EvaluationError: If a named sequence is not there.
+        OutputError: If ``out`` holds what no benchmark wrote.
     """
+    check_own(out, "bench.json", ("format", "runs"))
     begin = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
     folders = sequences(settings, (SYNTHETIC,))
@@ -119,6 +124,15 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
     }
     write_text(out / "bench.json", json.dumps(record, indent=1, default=str) + "\n")
     return record
+
+
+def check_own(out: Path, record: str = "", keys: Collection[str] = ()) -> None:
+    """Check that a benchmark may write its cases into a folder, and its record, if it has one, with such keys.
+
+    Raises:
+        OutputError: If they would replace what none wrote.
+    """
+    check_free(out, (CASES, record or CASES), lambda folder: is_experiment(folder, CASES, record, keys))
 
 
 def asked(settings: BenchSettings) -> dict[str, Any]:
@@ -156,7 +170,7 @@ def run_rows(
                 case = {"commit": commit, "recording": str(folder), "arguments": arguments, "first": first}
                 own = f"{row}_{name}_seed{seed}".removeprefix("_")
                 function = f"{__name__}:run_sequence"
-                tasks[name, seed, row] = Task(out / "cases", own, function, case, {"out": str(out / own)})
+                tasks[name, seed, row] = Task(out / CASES, own, function, case, {"out": str(out / own)})
     start = partial(start_module, MODULE, environment={})  # threads as the user's own runs have them
     found = {}
     for key, result, ended in run_tasks(tasks, Local(1, Limits(_RUN_TIMEOUT_S), start=start)):

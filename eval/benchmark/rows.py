@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edgeslam_torch.eval.benchmark.benchmark import FIGURES, BenchSettings, asked, run_rows, sequences
+from edgeslam_torch.eval.benchmark.benchmark import FIGURES, BenchSettings, asked, check_own, run_rows, sequences
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.conditions import machine, stamp
 from edgeslam_torch.eval.experiment.figures import Figure, changes, grouped, markdown_table
 from edgeslam_torch.files.atomic import write_text
 
+RECORD = "ablation.json"
 DEFAULT = "default"
 """Name of the row that all others are compared with."""
 
@@ -59,7 +60,9 @@ def run_ablation(
 
     Raises:
         EvaluationError: If a row or a sequence does not exist.
+        OutputError: If ``out`` holds what no ablation wrote.
     """
+    check_own(out, RECORD, ("machine", "settings", "rows"))
     unknown = [name for name in names if name not in ROWS]
     if unknown:
         raise EvaluationError(f"no row {unknown[0]!r}; there are {', '.join(ROWS)}")
@@ -69,7 +72,7 @@ def run_ablation(
     found = run_rows(settings, sequences(settings), rows, out, say)
     kept = {name: {"runs": [_kept(run) for run in found.get(name, [])]} for name in ROWS}
     record = stamp() | {"machine": machine(), "settings": asked(settings), "rows": kept}
-    write_text(out / "ablation.json", json.dumps(record, indent=1) + "\n")
+    write_text(out / RECORD, json.dumps(record, indent=1) + "\n")
     return record
 
 
@@ -113,7 +116,12 @@ def _verdict(before: dict[str, Any], after: dict[str, Any], sequence: str) -> st
 def compare_networks(
     settings: BenchSettings, networks: Sequence[str], out: Path, say: Callable[[str], None]
 ) -> dict[str, dict[str, Any]]:
-    """The runs once with every depth network: a record of each, by the network's name as ``depth.weights`` takes it."""
+    """The runs once with every depth network: a record of each, by the network's name as ``depth.weights`` takes it.
+
+    Raises:
+        OutputError: If ``out`` holds what no benchmark wrote.
+    """
+    check_own(out)
     rows = {str(number): ((f"depth.weights={network}",), "") for number, network in enumerate(networks)}
     found = run_rows(settings, sequences(settings), rows, out, say)
     return {network: {"runs": runs} for network, runs in zip(networks, found.values(), strict=True)}

@@ -8,9 +8,10 @@ A case's folder holds ``case.json`` (what to do), ``log.txt`` and ``result.json`
 
 import importlib
 import json
+import os
 import subprocess
 import sys
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +21,7 @@ from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.plain import subfolder
-from edgeslam_torch.files.record_files import read_mapping
+from edgeslam_torch.files.record_files import is_record, read_mapping
 from edgeslam_torch.jobs.watched import Ended, Job, Limits, Start, end_with_parent, run_each, start_module
 
 MODULE = "edgeslam_torch.eval.experiment.runner"
@@ -68,6 +69,20 @@ class Task:
         content = {"key": self.key, "run": self.run, **self.beside, **self.case}
         write_text(folder / CASE, json.dumps(content, indent=1) + "\n")
         return folder
+
+
+def is_experiment(out: Path, cases: str, record: str = "", keys: Collection[str] = ()) -> bool:
+    """Whether an experiment wrote into a folder: its record, or while there is none its cases.
+
+    Args:
+        out: The folder.
+        cases: Name of the folder of the cases' folders in it.
+        record: Name of the record in it.
+        keys: What such a record has.
+    """
+    if record and os.path.lexists(out / record):
+        return is_record(out / record, keys)
+    return any(is_record(case, ("key", "run")) for case in (out / cases).glob(f"*/{CASE}"))
 
 
 class Runner(Protocol):

@@ -17,9 +17,10 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.conditions import machine
 from edgeslam_torch.eval.inputs.dataset import find_recordings
 from edgeslam_torch.eval.judge.cells import CASES, Cell, list_cells
+from edgeslam_torch.eval.judge.runner import COMMANDS as FOLDER
 from edgeslam_torch.eval.judge.table import Row
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.files.record_files import read_mapping
+from edgeslam_torch.files.record_files import is_record, read_mapping
 
 RUNS: dict[str, int] = CASES["release"]["cells"]
 """Cells with their number of seeds."""
@@ -27,6 +28,11 @@ FIGURES: dict[str, int] = CASES["release"]["figures"]
 """What is kept of a run, with decimals."""
 COMMANDS: dict[str, str] = CASES["release"]["commands"]
 """Commands whose output the documents show, in this order: later ones use what earlier ones wrote."""
+
+
+def is_release(path: Path) -> bool:
+    """Whether a file is the record of a release."""
+    return is_record(path, ("version", "commit", "runs", "outputs"))
 
 
 def release_cells(data: Path | None) -> list[Cell]:
@@ -86,7 +92,7 @@ def command_outputs(data: Path, out: Path, commit: str, say: Callable[[str], Non
     Raises:
         EvaluationError: If one fails.
     """
-    folder = out / "commands"
+    folder = out / FOLDER
     kept = folder / "outputs.json"
     found = read_mapping(kept, "JSON", EvaluationError) if kept.is_file() else {}
     if found.get("key") != [commit, COMMANDS]:

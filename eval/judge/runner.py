@@ -7,14 +7,17 @@ from typing import Any
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.conditions import code_state, stamp
-from edgeslam_torch.eval.experiment.runner import CASE, Local, Runner, Task, run_tasks
+from edgeslam_torch.eval.experiment.runner import CASE, Local, Runner, Task, is_experiment, run_tasks
 from edgeslam_torch.eval.judge.cells import Cell
 from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.jobs.watched import Limits
+from edgeslam_torch.writers.own_folder import check_free
 
-RECORD = "judge.json"
+RECORD, TABLE = "judge.json", "judge.md"
 FORMAT = 1
 """Of the record."""
+CELLS, COMMANDS = "cells", "commands"
+"""Folders of the cells' folders, and of the commands that a release runs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +56,12 @@ def judge(
     Returns:
         The record: conditions, and a row for every cell with its figures, or with the reason why it has none; the
         cells that an earlier call with the same code and settings left in ``out`` are among them.
+
+    Raises:
+        OutputError: If ``out`` holds what no judge wrote.
     """
+    names = (RECORD, TABLE, CELLS, COMMANDS)
+    check_free(out, names, lambda folder: is_experiment(folder, CELLS, RECORD, ("format", "rows")))
     commit = code_state() if commit is None else commit
     flights = settings.flights or out / "flights"
     flights.mkdir(parents=True, exist_ok=True)
@@ -66,7 +74,7 @@ def judge(
         }
         case |= {"cell": cell.to_dict()}
         return Task(
-            out / "cells", cell.slug, "edgeslam_torch.eval.judge.run_cell:run_cell", case, {"flights": str(flights)}
+            out / CELLS, cell.slug, "edgeslam_torch.eval.judge.run_cell:run_cell", case, {"flights": str(flights)}
         )
 
     runner = runner or Local(settings.jobs, Limits(settings.timeout_s))
@@ -94,7 +102,7 @@ def _order(row: dict[str, Any]) -> tuple[bool, str, int]:
 def _cells_in(out: Path) -> list[Cell]:
     """Cells with a folder in ``out``."""
     cells = []
-    for path in sorted((out / "cells").glob(f"*/{CASE}")):
+    for path in sorted((out / CELLS).glob(f"*/{CASE}")):
         try:
             cells.append(Cell(**read_mapping(path, "JSON", EvaluationError)["cell"]))
         except (TypeError, KeyError, ValueError) as error:

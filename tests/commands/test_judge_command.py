@@ -1,11 +1,14 @@
 """``edgeslam judge`` from the command line, on a recording of a few small images."""
 
 import json
+from pathlib import Path
 
 import pytest
 from rendered import panels
 
 from edgeslam_torch import cli
+
+RELEASE = Path(__file__).parents[2] / "docs" / "results" / "0.3.json"
 
 
 @pytest.fixture(scope="module")
@@ -44,3 +47,19 @@ def test_without_recordings_it_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("EDGESLAM_DATA", raising=False)
     assert cli.main(["judge", "--out", str(tmp_path)]) == 1
     assert "no recordings: DATA or EDGESLAM_DATA" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", ["precious", '{"version": "1"}'])
+def test_a_release_replaces_nothing_but_a_release(data, tmp_path, capsys, monkeypatch, content):
+    """Of its own results it comes as far as the runs."""
+
+    def words(path):
+        assert cli.main(["judge", str(data), "--out", str(tmp_path / "out"), "--release", str(path)]) == 1
+        return capsys.readouterr().err
+
+    path = tmp_path / "0.3.json"
+    path.write_text(content)
+    assert str(path) in words(path)
+    assert path.read_text() == content
+    assert "missing" in words(RELEASE), "stairs are not all that a release needs"
+    assert str(data / "stairs") in words(data / "stairs" / "new.mcap")

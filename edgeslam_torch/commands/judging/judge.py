@@ -7,6 +7,7 @@ from pathlib import Path
 from edgeslam_torch.commands.judging._common import recordings, say, writing
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.output_file import add_overwrite_to, check_new, check_not_read
 
 CELLS = ("base", "variants", "flights", "telemetry", "imu", "all")
 
@@ -42,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.json",
         help="instead run what the documents quote, and write its figures here (docs/results)",
     )
+    add_overwrite_to(parser)
     parser.add_argument("--flights", type=Path, metavar="DIR", help="cache of simulated flights (default: in --out)")
     parser.add_argument("--thresholds", type=Path, metavar="FILE", help="limits to check (default: the project's own)")
     parser.add_argument("--against", type=Path, metavar="DIR", help="also compare with another judge's --out")
@@ -52,8 +54,8 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.config import SlamConfig
     from edgeslam_torch.eval.experiment.figures import compared, read_record
     from edgeslam_torch.eval.judge.cells import list_cells
-    from edgeslam_torch.eval.judge.release import command_outputs, release_cells, release_record
-    from edgeslam_torch.eval.judge.runner import FORMAT, RECORD, JudgeSettings, judge
+    from edgeslam_torch.eval.judge.release import command_outputs, is_release, release_cells, release_record
+    from edgeslam_torch.eval.judge.runner import FORMAT, RECORD, TABLE, JudgeSettings, judge
     from edgeslam_torch.eval.judge.score import COLUMNS
     from edgeslam_torch.eval.judge.table import THRESHOLDS, markdown, read_thresholds
     from edgeslam_torch.files.config_file import load_config
@@ -67,6 +69,9 @@ def main(args: argparse.Namespace) -> int:
     if args.release is not None and (args.only or args.set or args.max_frames):
         raise ConfigError("--release runs its own cells with default settings: omit --only, --set and --max-frames")
     if args.release is not None:
+        read = [path for path in (data, args.thresholds, args.against, args.flights) if path is not None]
+        check_not_read(args.release, read, "--release")
+        check_new(args.release, args.overwrite or is_release(args.release), "--release")
         cells = release_cells(data)
         say(f"release: {len(cells)} runs; call it again to resume after an interruption")
     else:
@@ -78,7 +83,7 @@ def main(args: argparse.Namespace) -> int:
         if before is not None:
             text += "\n" + compared(before, record, "rows", "cell", COLUMNS)
         write_text(args.out / RECORD, json.dumps(record, indent=1) + "\n")
-        write_text(args.out / "judge.md", text)
+        write_text(args.out / TABLE, text)
         if args.release is not None:
             assert data is not None
             outputs = command_outputs(data, args.out, record["commit"], say)

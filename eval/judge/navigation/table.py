@@ -9,11 +9,14 @@ import numpy as np
 
 from edgeslam_torch.eval.experiment.conditions import code_state
 from edgeslam_torch.eval.experiment.figures import markdown_table
-from edgeslam_torch.eval.experiment.runner import Local, Task, run_tasks
+from edgeslam_torch.eval.experiment.runner import Local, Task, is_experiment, run_tasks
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.jobs.watched import Limits
+from edgeslam_torch.writers.own_folder import check_free
 
+TABLE, FLIGHTS = "navigation.md", "flights"
+"""Names in the output folder."""
 FAILED = "failed"
 """Prefix of the ending of a flight that raised an error."""
 _TIMEOUT_S = 3600.0
@@ -39,11 +42,15 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
 
     Returns:
         All flights. One that raised an error or whose process died counts as flown and not reached.
+
+    Raises:
+        OutputError: If ``out`` holds what no such judge wrote.
     """
+    check_free(out, (TABLE, FLIGHTS), lambda folder: is_experiment(folder, FLIGHTS))
     commit = code_state()
     tasks = {
         case: Task(
-            out / "flights",
+            out / FLIGHTS,
             case.name,
             "edgeslam_torch.eval.judge.navigation.table:run_flight",
             {"commit": commit, "flight": Flown(case).record()["case"]},
@@ -59,7 +66,7 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
         if ended is not None:
             say(_line(flights[case]))
     done = [flights[case] for case in cases]
-    write_text(out / "navigation.md", markdown(done))
+    write_text(out / TABLE, markdown(done))
     return done
 
 

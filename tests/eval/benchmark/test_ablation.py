@@ -6,9 +6,9 @@ import pytest
 from markdown_rows import rows
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.eval.benchmark import benchmark
-from edgeslam_torch.eval.benchmark.benchmark import BenchSettings
+from edgeslam_torch.eval.benchmark.benchmark import BenchSettings, run_benchmark
 from edgeslam_torch.eval.benchmark.rows import (
     ROWS,
     compare_networks,
@@ -79,3 +79,23 @@ def test_depth_networks_are_beside_each_other(runs, tmp_path):
         ["none", "kitchen, seed 0", "0.0300", "-"],
     ]
     assert [line[-1] for line in lines] == ["3.0", "3.0"]
+
+
+WRITERS = {
+    "bench.json": lambda settings, out: run_benchmark(settings, out, print),
+    "ablation.json": lambda settings, out: run_ablation(settings, (), out, print),
+    "cases/mine.txt": lambda settings, out: compare_networks(settings, ["none"], out, print),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_results_of_others_are_not_replaced_and_own_ones_are(runs, tmp_path, name):
+    settings, theirs, ours = BenchSettings(tmp_path, (0,), ("kitchen",)), tmp_path / "theirs", tmp_path / "ours"
+    (theirs / name).parent.mkdir(parents=True)
+    (theirs / name).write_text("precious")
+    with pytest.raises(OutputError):
+        WRITERS[name](settings, theirs)
+    assert (theirs / name).read_text() == "precious" and runs == []
+    ours.mkdir()
+    for _ in range(2):
+        WRITERS[name](settings, ours)

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from edgeslam_torch.errors import OutputError
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment import runner
 from edgeslam_torch.eval.experiment.runner import Local, Task
@@ -125,3 +126,24 @@ def test_record_holds_what_earlier_calls_left(tmp_path):
     run(tmp_path, ["a"], starter)
     assert [row["cell"] for row in run(tmp_path, ["b"], starter)["rows"]] == ["a", "b"]
     assert [row["cell"] for row in run(tmp_path, ["b"], starter, commit="def")["rows"]] == ["b"]
+
+
+@pytest.mark.parametrize("name", ["judge.json", "judge.md", "cells/good-s0/case.json", "commands/mine.txt", "rgb.txt"])
+def test_a_judge_writes_into_no_folder_of_others(tmp_path, name):
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text("precious")
+    with pytest.raises(OutputError):
+        run(tmp_path, ["good"], starter := Starter())
+    assert starter.started == []
+    assert [p for p in tmp_path.rglob("*") if p.is_file()] == [tmp_path / name]
+    assert (tmp_path / name).read_text() == "precious"
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_a_judge_goes_on_where_it_ended_or_was_interrupted(tmp_path, ended):
+    record = run(tmp_path, ["good"], Starter())
+    if ended:
+        (tmp_path / "judge.json").write_text(json.dumps(record))
+        (tmp_path / "judge.md").touch()
+    run(tmp_path, ["good"], again := Starter())
+    assert again.started == []

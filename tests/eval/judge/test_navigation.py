@@ -5,6 +5,7 @@ import pytest
 from markdown_rows import row, rows
 
 from edgeslam_torch.cli import main
+from edgeslam_torch.errors import OutputError
 from edgeslam_torch.eval.experiment.runner import Task
 from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, corridor_ends, right_exits
 from edgeslam_torch.eval.judge.navigation.flight import fly, shortest_m, true_layer
@@ -43,6 +44,14 @@ def test_flights_are_kept_and_one_that_fails_ends_no_other(tmp_path, monkeypatch
     assert flights[0].ended.startswith("failed: ") and "nowhere" in flights[0].ended
     assert len(said) == 1 and "nowhere" in said[0]
     assert row((tmp_path / "navigation.md").read_text(), "nowhere")["reached"].startswith("0 ")
+    assert len(judge_flights([good], tmp_path, 1, said.append)) == 1
+
+
+def test_flights_are_not_judged_into_a_folder_of_others(tmp_path):
+    (tmp_path / "navigation.md").write_text("precious")
+    with pytest.raises(OutputError):
+        judge_flights([], tmp_path, 1, print)
+    assert (tmp_path / "navigation.md").read_text() == "precious"
 
 
 def exit_at(true, aside=0.0, turned=0.0):
