@@ -355,6 +355,17 @@ def test_runs_without_out_are_numbered_and_none_is_replaced(edgeslam, recording,
         assert (tmp_path / "runs" / name / "trajectory.txt").is_file()
 
 
+def test_images_of_others_are_not_replaced_by_kept_ones(edgeslam, recording, tmp_path):
+    theirs = tmp_path / "out" / "images" / "1.000000.jpg"
+    theirs.parent.mkdir(parents=True)
+    theirs.write_text("precious")
+    words = ("run", recording, "--out", tmp_path / "out", "--no-report")
+    assert edgeslam(*words, "--keep-images")[0] == 1
+    assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == [theirs]
+    assert edgeslam("run", recording, "--out", tmp_path / "own", "--no-report", "--keep-images")[0] == 0
+    assert edgeslam("run", recording, "--out", tmp_path / "own", "--no-report", "--keep-images")[0] == 0
+
+
 def test_a_recording_is_no_run_to_view_or_report(edgeslam, recording):
     (recording / "groundtruth.txt").write_text("100.0 0 0 0 0 0 0 1\n100.1 0 0 0 0 0 0 1\n")
     before = sorted(recording.iterdir())

@@ -64,11 +64,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Run the demo and print the results."""
     from edgeslam_torch.commands.run import check_tracked, resolved_config, write_page
-    from edgeslam_torch.demo import record, run_and_judge
+    from edgeslam_torch.demo import SCORE, record, run_and_judge
     from edgeslam_torch.terminal.run_progress import RunProgress
+    from edgeslam_torch.writers.own_folder import check_free
+    from edgeslam_torch.writers.run_writer import OUTPUTS
 
     settings = _settings(args)
     config = resolved_config(args)
+    check_free(args.out, () if args.record_only else (*OUTPUTS, SCORE))
     if args.flights is not None:
         return _record_many(args, settings)
     with RunProgress("preparing the flight") as progress:

@@ -151,8 +151,10 @@ def main(args: argparse.Namespace) -> int:
 
             listeners.append(LiveView(source.name, source.camera, args.save_rrd))
         if args.keep_images:
-            from edgeslam_torch.writers.keyframe_images import KeyframeImages
+            from edgeslam_torch.writers.keyframe_images import FOLDER, KeyframeImages
+            from edgeslam_torch.writers.own_folder import check_free
 
+            check_free(out, (FOLDER,))
             listeners.append(KeyframeImages(out))
         if args.save_mcap is not None:
             from edgeslam_torch.readers.pace import ReadingsCursor

@@ -37,6 +37,18 @@ def test_a_demo_clears_no_recording_of_somebody_else(tmp_path):
     assert (tmp_path / "rgb" / "1.0.png").read_text() == "theirs"
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("rgb.txt", []), ("demo.json", []), ("trajectory.txt", []), ("rgb.txt", ["--record-only"])]
+    + [("flight.mp4", ["--record-only", "--flights", "2"])],
+)
+def test_a_folder_of_others_is_refused_before_the_flight(tmp_path, monkeypatch, name, words):
+    monkeypatch.setattr("edgeslam_torch.demo.record", lambda *given: pytest.fail("flown"))
+    (tmp_path / name).write_text("precious")
+    assert main(["demo", "--out", str(tmp_path), *words]) == 1
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: "precious"}
+
+
 @pytest.mark.slow
 def test_demo_runs_and_judges_itself(tmp_path):
     settings = DemoSettings(seconds=6.0, rate_hz=12.0, width=320, height=240)
