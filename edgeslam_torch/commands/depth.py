@@ -59,7 +59,9 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.frontend.depth_check import MIN_SHARE, CheckedDepth
     from edgeslam_torch.frontend.depth_network import open_depth, weights_path
     from edgeslam_torch.terminal.progress import counted
+    from edgeslam_torch.writers.own_folder import check_pictures
 
+    check_pictures(args.out, _is_depth, "give another folder to --out")
     network = open_depth(weights_path(args.depth), args.backend, args.threads, args.device)
     if not network.is_metric:
         raise ConfigError(f"{network.weights}: gives depth up to scale and shift; a map has both: edgeslam run --depth")
@@ -114,6 +116,11 @@ def write_depth(folder: Path, stem: str, depth: "DepthMap", with_sigma: bool = F
         write_image(folder / name, image)
     if with_sigma:
         write_atomically(folder / f"{stem}_sigma.npy", lambda file: np.save(file, depth.sigma_log))
+
+
+def _is_depth(path: Path) -> bool:
+    """Whether a picture is one of a depth map's."""
+    return path.with_name(f"{path.stem.removesuffix('_colour')}.npy").is_file()
 
 
 def _names(stem: str, with_sigma: bool) -> list[str]:

@@ -15,7 +15,16 @@ if TYPE_CHECKING:
 _SAME_S = 1e-3
 """Stamps that differ by less are the same frame's."""
 _KEEP = "of a bag or a video, 'edgeslam run --keep-images' keeps them"
-FORMATS = ("ply", "pcd", "las", "colmap", "nerfstudio", "occupancy")
+_PLACES = {
+    "ply": "export.ply",
+    "pcd": "edge_map.pcd",
+    "las": "edge_map.las",
+    "colmap": "colmap",
+    "nerfstudio": "nerfstudio",
+    "occupancy": "occupancy",
+}
+"""Default of ``--out``, in the run's folder."""
+FORMATS = tuple(_PLACES)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,13 +46,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Write the map and print its path."""
     from edgeslam_torch.eval.inputs.run_folder import open_run
+    from edgeslam_torch.writers.own_folder import check_pictures, is_run
 
     run = open_run(args.run)
-    if args.out is not None:
-        recording = [run.source] if run.source is not None else []
-        for path in _files(args.out, args.format):
-            check_not_read(path, recording if path.suffix == ".png" else [args.run], "--out")
-            check_new(path, args.overwrite)
+    out: Path = args.out or run.path / _PLACES[args.format]
+    recording = [run.source] if run.source is not None else []
+    replaces = args.overwrite or (args.out is None and is_run(run.path))
+    for path in _files(out, args.format):
+        check_not_read(path, recording if path.suffix in (".png", ".pgm") else [args.run], "--out")
+        check_new(path, replaces)
+    if args.format == "occupancy":
+        check_pictures(out.parent, lambda path: path.with_suffix(".yaml").exists(), "give another --out")
     cloud = _chosen(run, args)
     try:
         place = _WRITERS[args.format](run, cloud, args)
@@ -92,7 +105,7 @@ def _ply(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Pat
     from edgeslam_torch.writers.maps.directions import edge_directions
     from edgeslam_torch.writers.ply import write_ply
 
-    path: Path = args.out or run.path / "export.ply"
+    path: Path = args.out or run.path / _PLACES["ply"]
     centres_w = run.trajectory.positions[run.keyframe_poses()]
     write_ply(path, cloud, (f"units: {run.units}", run.vertical), edge_directions(cloud.p_w, centres_w))
     return path
@@ -101,7 +114,7 @@ def _ply(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Pat
 def _las(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
     from edgeslam_torch.writers.maps.las import write_las
 
-    path: Path = args.out or run.path / "edge_map.las"
+    path: Path = args.out or run.path / _PLACES["las"]
     write_las(path, cloud, run.vertical)
     return path
 
@@ -109,7 +122,7 @@ def _las(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Pat
 def _pcd(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
     from edgeslam_torch.writers.maps.pcd import write_pcd
 
-    path: Path = args.out or run.path / "edge_map.pcd"
+    path: Path = args.out or run.path / _PLACES["pcd"]
     write_pcd(path, cloud, run.vertical)
     return path
 
@@ -119,7 +132,7 @@ def _colmap(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> 
     from edgeslam_torch.geometry.camera_file import load_camera
     from edgeslam_torch.writers.maps.colmap import write_colmap
 
-    folder: Path = args.out or subfolder(run.path, "colmap")
+    folder: Path = args.out or subfolder(run.path, _PLACES["colmap"])
     camera = load_camera(run.path / "camera.yaml")
     seen, anchors, index = _seen(run)
     paths = image_paths(run, seen.stamps_s)
@@ -138,7 +151,7 @@ def _nerfstudio(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace)
     from edgeslam_torch.geometry.camera_file import load_camera
     from edgeslam_torch.writers.maps.nerfstudio import write_nerfstudio
 
-    folder: Path = args.out or subfolder(run.path, "nerfstudio")
+    folder: Path = args.out or subfolder(run.path, _PLACES["nerfstudio"])
     camera = load_camera(run.path / "camera.yaml")
     seen, anchors, index = _seen(run)
     paths = [path for path in image_paths(run, seen.stamps_s) if path is not None]
@@ -195,7 +208,7 @@ def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) 
     seen, anchors, index = _seen(run, "free space of the grid needs camera poses")
     eye_w = run.trajectory.positions[index]
     lines = SightLines(eye_w[seen.keyframe], anchors.p_w[seen.anchor].astype(float), anchors.sigma_m[seen.anchor])
-    path: Path = args.out or run.path / "occupancy"
+    path: Path = args.out or run.path / _PLACES["occupancy"]
     write_occupancy(path, occupancy_grid(cloud.p_w, lines, run.trajectory.positions, args.resolution, heights))
     return path.with_suffix(".yaml")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.errors import ConfigError, OutputError
-from edgeslam_torch.files.output_file import output_file
+from edgeslam_torch.files.output_file import check_new, output_file
 from edgeslam_torch.models.record import weights_file
 
 if TYPE_CHECKING:
@@ -76,6 +76,8 @@ def _download(args: argparse.Namespace) -> None:
         raw = cache_folder() / f"{remote.name}.pth.tar"
     else:
         raise ConfigError(f"no weights called {args.name!r}; there are {', '.join([*REMOTES, *PRESETS])}")
+    if args.out is not None and args.name in PRESETS:  # the description is written beside the network
+        check_new(args.out.with_suffix(".toml"), args.overwrite)
     try:
         before = remembered(raw)
         fetched = _fetch(remote, raw, args.sha256)

@@ -24,6 +24,7 @@ from edgeslam_torch.eval.report import words
 from edgeslam_torch.eval.report.flight_section import flight_section
 from edgeslam_torch.eval.report.keyframe_pictures import keyframe_pictures
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.plain import open_plain
 from edgeslam_torch.readers.images import pixels_or_none
 from edgeslam_torch.types import FloatArray, PointCloud
 from edgeslam_torch.writers.own_folder import check_free
@@ -39,6 +40,10 @@ _MAX_POSES = 6000
 _MAX_KEYFRAMES = 12
 _KEYFRAME_WIDTH_PX = 480
 _MAX_FRUSTA = 60
+_HEAD_BYTES = 10_000
+PAGE = "report.html"
+_TITLE_END = ", EdgeSLAM-Torch"
+"""Of every page: what tells one from a file of others."""
 TEMPLATE = Path(__file__).parent / "template"
 _SCRIPTS = ("data.js", "viewer.js", "charts.js", "page.js")
 
@@ -65,11 +70,21 @@ def write_report(
     if run.path.is_file():
         raise EvaluationError(f"{run.path}: a report needs a run's folder, this is a single file")
     if out is None:
-        check_free(run.path, (), "give the folder of a run")
-    out = Path(out) if out is not None else run.path / "report.html"
+        outputs = () if _is_page(run.path / PAGE) else (PAGE,)
+        check_free(run.path, outputs, remedy="give the folder of a run")
+    out = Path(out) if out is not None else run.path / PAGE
     score, truth = judge_run(run, groundtruth, judge_map)
     write_text(out, render(run, score, truth))
     return out
+
+
+def _is_page(path: Path) -> bool:
+    """Whether a file is such a page."""
+    try:
+        with open_plain(path) as file:
+            return f"{_TITLE_END}</title>".encode() in file.read(_HEAD_BYTES)
+    except OSError:
+        return False
 
 
 def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | None = None) -> str:
@@ -83,7 +98,7 @@ def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | No
     parts = {
         "style": (TEMPLATE / "style.css").read_text(encoding="utf-8"),
         "script": script,
-        "title": html.escape(f"{data['title']}, EdgeSLAM-Torch"),
+        "title": html.escape(f"{data['title']}{_TITLE_END}"),
         "edges": packed_edges,
         "anchors": packed_anchors,
         "data": text,

@@ -15,6 +15,7 @@ import pytest
 import torch
 from small_networks import FAR_M, NEAR_M, RELATIVE, describe, green_network
 
+from edgeslam_torch.cli import main
 from edgeslam_torch.errors import ConfigError, EdgeSlamError
 from edgeslam_torch.frontend.depth_network import DepthPredictor
 from edgeslam_torch.frontend.external_depth import ExternalDepth
@@ -74,10 +75,22 @@ def test_depth_of_a_folder(weights, pictures, tmp_path, capsys):
 
 
 def test_depth_maps_never_take_the_images_place(weights, pictures):
+    for old in list(pictures.glob("*.png"))[2:]:
+        old.unlink()
     before = {p.name: p.read_bytes() for p in pictures.iterdir()}
     with pytest.raises(EdgeSlamError, match="holds the images themselves"):
         run("depth", pictures, "--out", pictures, "--weights", weights)
     assert {p.name: p.read_bytes() for p in pictures.iterdir()} == before
+
+
+def test_depth_maps_are_not_added_to_pictures_of_others(weights, pictures, tmp_path):
+    (pictures / "img0.png").rename(tmp_path / "one.png")
+    before = {p.name: p.read_bytes() for p in pictures.iterdir()}
+    with pytest.raises(EdgeSlamError):
+        run("depth", tmp_path / "one.png", "--out", pictures, "--weights", weights)
+    assert {p.name: p.read_bytes() for p in pictures.iterdir()} == before
+    for k in range(1, 5):
+        run("depth", pictures / f"img{k}.png", "--out", tmp_path / "out", "--weights", weights)
 
 
 def test_depth_maps_that_cannot_be_meant_are_unknown_and_counted(weights, pictures, tmp_path, capsys, monkeypatch):
@@ -172,6 +185,17 @@ def test_download_says_how_far_a_file_can_be_trusted(tmp_path, capsys, monkeypat
     content += b"\0"
     with pytest.raises(EdgeSlamError, match="has changed since"):
         run("weights", "download", name)
+
+
+def test_a_description_of_a_network_replaces_no_file_of_others(tmp_path, monkeypatch):
+    from edgeslam_torch.models import download as module
+
+    monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(module, "fetch", lambda *given: pytest.fail("fetched"))
+    (tmp_path / "settings.toml").write_text("precious")
+    out = tmp_path / "settings.onnx"
+    assert main(["weights", "download", "depth-anything-v2-small", "--out", str(out)]) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["settings.toml"]
 
 
 def test_two_images_of_one_name_are_two_depth_maps(weights, pictures, tmp_path):

@@ -44,6 +44,21 @@ def test_several_runs_give_an_aligned_table(run_folder, tmp_path, capsys):
     assert (tmp_path / "plots" / "trajectories.png").is_file()
 
 
+def test_plots_are_not_added_to_pictures_of_others(run_folder, tmp_path):
+    truth = run_folder(tmp_path / "a")
+    words = (*[tmp_path / "a"] * 3, "--groundtruth", truth, "--plots")
+    theirs = tmp_path / "pictures"
+    theirs.mkdir()
+    for i in range(5):
+        (theirs / f"{i}.png").touch()
+    with pytest.raises(EdgeSlamError):
+        run(eval_command, *words, theirs)
+    assert len(list(theirs.iterdir())) == 5
+    for own in ("plots", "a/plots", "a"):
+        for more in ([], ["--overwrite"]):
+            assert run(eval_command, *words, tmp_path / own, *more) == 0
+
+
 def own_recording(run_dir, truth):
     """The run says that it read a folder with ground truth."""
     folder = run_dir.parent / f"recording of {run_dir.name}"
@@ -103,7 +118,11 @@ def test_report_of_a_bare_run_is_a_page_too(run_folder, tmp_path):
     run_folder(tmp_path / "a")
     for name in ("status.csv", "summary.json", "edge_map.ply", "anchors.ply", "config.toml", "trajectory_online.txt"):
         (tmp_path / "a" / name).unlink()
-    assert run(report_command, tmp_path / "a") == 0
+    assert run(report_command, tmp_path / "a") == run(report_command, tmp_path / "a") == 0
+    (tmp_path / "a" / "report.html").write_text("<title>precious</title>")
+    with pytest.raises(EdgeSlamError):
+        run(report_command, tmp_path / "a")
+    assert (tmp_path / "a" / "report.html").read_text() == "<title>precious</title>"
 
 
 def test_depth_maps_are_judged_by_name(tmp_path, capsys):

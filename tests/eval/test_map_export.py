@@ -206,6 +206,32 @@ def test_nerfstudio_replaces_no_picture_of_the_recording(options, run, tmp_path)
         export(run, "--format", "nerfstudio", "--out", tmp_path / "flight", *options)
 
 
+def test_maps_are_not_added_to_pictures_of_others(run, tmp_path):
+    theirs = tmp_path / "pictures"
+    theirs.mkdir()
+    for i in range(4):
+        (theirs / f"{i}.png").touch()
+    with pytest.raises(OutputError):
+        export(run, "--format", "occupancy", "--out", theirs / "map")
+    assert len(list(theirs.iterdir())) == 4
+    for name in "abcd":
+        export(run, "--format", "occupancy", "--out", run / name)
+        export(run, "--format", "occupancy", "--out", tmp_path / name)
+
+
+@pytest.mark.parametrize("form", export_map.FORMATS)
+def test_no_file_of_a_folder_that_is_no_run_is_replaced_unasked(form, run):
+    for name in ("status.csv", "summary.json"):
+        (run / name).unlink()
+    names = {"ply": "export.ply", "las": "edge_map.las", "pcd": "edge_map.pcd", "colmap": "colmap/images.txt"}
+    path = run / names.get(form, {"nerfstudio": "nerfstudio/transforms.json"}.get(form, "occupancy.yaml"))
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("precious")
+    with pytest.raises(OutputError):
+        export(run, "--format", form, "--z-is-up")
+    assert path.read_text() == "precious"
+
+
 def test_occupancy_needs_metres(run):
     with_summary(run, scale={"value": 1.0, "sigma": 0.03, "units": "arbitrary"})
     with pytest.raises(EdgeSlamError, match="metric scale"):

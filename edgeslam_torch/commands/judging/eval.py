@@ -3,6 +3,7 @@
 import argparse
 import json
 import math
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,10 @@ from edgeslam_torch.files.output_file import add_overwrite_to, check_new, output
 if TYPE_CHECKING:
     from edgeslam_torch.eval.metrics.run_score import RunScore
     from edgeslam_torch.eval.metrics.trajectory_error import CommonScore
+
+
+_PLOT = re.compile(r"\d{2,}_.*\.png|trajectories(_\d{2,})?\.png")
+"""Names of the files of ``--plots``."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -68,9 +73,12 @@ def main(args: argparse.Namespace) -> int:
     """Print the tables; 0 when every run could be judged."""
     from edgeslam_torch.eval.metrics.run_score import evaluate_run
     from edgeslam_torch.terminal.progress import counted
+    from edgeslam_torch.writers.own_folder import check_pictures
 
     if args.depth_maps:
         return _depth_maps(args)
+    if args.plots is not None:
+        check_pictures(args.plots, lambda path: _PLOT.fullmatch(path.name) is not None, "give another --plots")
     scores: list[RunScore] = []
     judged: list[tuple[Path, Path]] = []
     failures: list[str] = []
