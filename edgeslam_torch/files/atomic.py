@@ -11,19 +11,21 @@ from typing import BinaryIO
 
 from edgeslam_torch.files.plain import check_replaceable, open_exclusively
 
-_PARTIAL = ".edgeslam-{}.part"
-_PARTIAL_NAME = re.compile(r"\.edgeslam-[0-9a-f]{16}\.part")
+_PARTIAL = ".edgeslam-{:08x}-{}.part"
+_PARTIAL_NAME = re.compile(r"\.edgeslam-(?:([0-9a-f]{8})-)?[0-9a-f]{16}\.part")
+"""With the process that writes it."""
 
 
 def partial_beside(path: Path) -> Path:
     """Unforeseeable name for a file that will be ``path`` when it is complete."""
-    return path.with_name(_PARTIAL.format(secrets.token_hex(8)))
+    return path.with_name(_PARTIAL.format(os.getpid(), secrets.token_hex(8)))
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove what killed processes have left in a folder of ours."""
+    """Remove what killed processes have left in a folder of ours; what this one is writing stays."""
     for path in folder.iterdir():
-        if _PARTIAL_NAME.fullmatch(path.name):
+        found = _PARTIAL_NAME.fullmatch(path.name)
+        if found is not None and found[1] != f"{os.getpid():08x}":
             path.unlink(missing_ok=True)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.appender import Appender
-from edgeslam_torch.files.atomic import remove_partials, write_atomically, write_text
+from edgeslam_torch.files.atomic import partial_beside, remove_partials, write_atomically, write_text
 from edgeslam_torch.files.plain import create, extend, subfolder, write_image, write_new
 from edgeslam_torch.writers.own_folder import FolderLock
 
@@ -69,10 +69,17 @@ def test_the_temporary_name_cannot_be_foreseen(tmp_path):
     for _ in range(2):
         write_atomically(tmp_path / ("a" * 250), lambda _: seen.append({p.name for p in tmp_path.glob(".*")}))
     assert len(seen[0] | seen[1]) == 2
-    (tmp_path / seen[0].pop()).write_text("left by a killed process")
+
+
+def test_partial_files_of_killed_processes_alone_are_removed(tmp_path, monkeypatch):
+    with monkeypatch.context() as killed:
+        killed.setattr(os, "getpid", lambda: 1)
+        partial_beside(tmp_path / "left.mcap").touch()
+    mine = partial_beside(tmp_path / "run.mcap")
+    mine.touch()
     (tmp_path / ".mine.part").write_text("of somebody else")
     remove_partials(tmp_path)
-    assert [p.name for p in tmp_path.glob(".*")] == [".mine.part"]
+    assert {p.name for p in tmp_path.glob(".*")} == {".mine.part", mine.name}
 
 
 def test_a_folder_of_ours_is_no_link(tmp_path):
