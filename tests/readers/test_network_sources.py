@@ -1,7 +1,9 @@
 """Cameras that people have: RTSP, MJPEG over HTTP, GStreamer pipelines, a webcam."""
 
+import io
 import shutil
 import threading
+import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import cv2
@@ -45,6 +47,51 @@ def test_a_phones_mjpeg_over_http():
         server.server_close()
     assert frames and frames[0].image.shape == (48, 64, 3)
     assert np.abs(frames[-1].image[20, 20].astype(int) - (0, 0, 255)).max() < 10
+
+
+def _jpegs(width, height):
+    data = cv2.imencode(".jpg", np.full((height, width, 3), 90, np.uint8))[1].tobytes()
+    return f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n".encode() + data + b"\r\n"
+
+
+def _h264(width, height):
+    av = pytest.importorskip("av")
+    clip = io.BytesIO()
+    with av.open(clip, "w", format="h264") as container:
+        stream = container.add_stream("libx264", rate=30, width=width, height=height, pix_fmt="yuv420p")
+        picture = av.VideoFrame.from_ndarray(np.full((height, width, 3), 90, np.uint8), format="bgr24")
+        for packet in [*(p for _ in range(5) for p in stream.encode(picture)), *stream.encode(None)]:
+            container.mux(packet)
+    return clip.getvalue()
+
+
+@pytest.mark.parametrize("coded", [_jpegs, _h264])
+def test_a_stream_whose_resolution_changes_ends_with_its_reason_and_is_not_stretched(coded):
+    large, small = coded(128, 96), coded(128, 48)
+
+    class Changing(_Mjpeg):
+        def do_GET(self):
+            self.send_response(200)
+            if coded is _jpegs:
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+            self.end_headers()
+            try:
+                for i in range(1000):
+                    self.wfile.write(large if i < 40 else small)
+                    time.sleep(0.02)
+            except OSError:
+                return
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Changing)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    frames = open_source(f"http://127.0.0.1:{server.server_port}/video").frames()
+    try:
+        with pytest.raises(SourceError, match="128x48 now and were 128x96: the resolution was changed in mid-stream"):
+            assert {frame.image.shape for frame in frames} == {(96, 128, 3)}
+    finally:
+        frames.close()
+        server.shutdown()
+        server.server_close()
 
 
 def test_an_address_where_nobody_is_is_refused_without_its_password():
