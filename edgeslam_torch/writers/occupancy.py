@@ -22,8 +22,8 @@ MAX_CELLS = 50_000_000
 _SIGMAS = 2.0
 """A line of sight frees space up to so many sigma before the point that was seen: beyond it, one point in fifty would
 free the wall that it lies on."""
-_CHUNK = 2000
-"""Lines at a time: bounds the memory."""
+_CHUNK = 2_000_000
+"""Places on lines at a time: bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,8 @@ def occupancy_grid(
     np.add.at(counts, (cell[inside, 1], cell[inside, 0]), 1)
     occupied = counts >= min_points
     grid = np.full((height, width), UNKNOWN, dtype=np.uint8)
-    free = np.concatenate([_looked_through(seen, resolution_m, (low, high)), positions[:, :2]])
+    box = np.array([[*lower, low], [*(lower + np.array([width, height]) * resolution_m), high]])
+    free = np.concatenate([_looked_through(seen, resolution_m, box), positions[:, :2]])
     column, row = np.floor((free - lower) / resolution_m).astype(int).T
     inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
     grid[row[inside], column[inside]] = FREE
@@ -125,22 +126,22 @@ def write_occupancy(path: Path, grid: OccupancyGrid) -> None:
     write_text(record, remark + yaml.safe_dump(fields, sort_keys=False))
 
 
-def _looked_through(seen: SightLines, resolution_m: float, z_range_m: tuple[float, float]) -> FloatArray:
-    """Points ``(S, 2)`` seen from above, half a cell apart, of every line within the heights."""
-    low, high = z_range_m
+def _looked_through(seen: SightLines, resolution_m: float, box_w: FloatArray) -> FloatArray:
+    """Points ``(S, 2)`` seen from above, half a cell apart, of every line within a box ``(2, 3)`` of two corners."""
+    way = seen.point_w - seen.eye_w
+    length = np.linalg.norm(way, axis=1)
+    farthest = np.linalg.norm(np.abs(seen.eye_w - box_w[:, None]).max(axis=0), axis=1)  # of the box from each eye
+    reach = np.minimum(length - _SIGMAS * seen.sigma_m - resolution_m, farthest + resolution_m)
+    good = np.isfinite(length) & (reach > 0.0)  # without a sigma the range is unknown
+    eye_w, way, reach = seen.eye_w[good], way[good] / length[good, None], reach[good]
     found = [np.zeros((0, 2))]
-    for first in range(0, len(seen.eye_w), _CHUNK):
-        part = slice(first, first + _CHUNK)
-        eye_w, way = seen.eye_w[part], seen.point_w[part] - seen.eye_w[part]
-        length = np.linalg.norm(way, axis=1)
-        reach = length - _SIGMAS * seen.sigma_m[part] - resolution_m
-        good = np.isfinite(reach) & (reach > 0.0)  # without a sigma the range is unknown
-        if not good.any():
-            continue
-        eye_w, way = eye_w[good], way[good] / length[good, None]
-        along = np.arange(0.0, float(reach[good].max()), 0.5 * resolution_m)
-        p = eye_w[:, None] + along[:, None] * way[:, None]
-        p = p[(along < reach[good, None]) & (p[:, :, 2] >= low) & (p[:, :, 2] <= high)]
+    along = np.arange(0.0, float(reach.max(initial=0.0)), 0.5 * resolution_m)
+    step = max(1, _CHUNK // max(1, len(along)))
+    for first in range(0, len(reach), step):
+        part = slice(first, first + step)
+        p = eye_w[part, None] + along[:, None] * way[part, None]
+        within = (p[:, :, 2] >= box_w[0, 2]) & (p[:, :, 2] <= box_w[1, 2])
+        p = p[(along < reach[part, None]) & within]
         cells = np.unique(np.floor(p[:, :2] / resolution_m).astype(int), axis=0)
         found.append((cells + 0.5) * resolution_m)
     return np.concatenate(found)

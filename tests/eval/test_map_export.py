@@ -162,6 +162,13 @@ def test_point_without_a_sigma_frees_nothing():
     assert value_at(occupancy_grid(wall, lines, np.array([[0.0, 0.0, 1.0]])), 1.0, 0.0) == UNKNOWN
 
 
+@pytest.mark.parametrize("far_m", [1e7, np.inf])
+def test_line_of_sight_that_leaves_the_grid_costs_no_more_memory_than_one_that_ends_in_it(far_m):
+    wall = np.concatenate([wall_at(2.0), [[far_m, 0.8, 1.0]]])
+    grid = occupancy_grid(wall_at(2.0), seen_from((0.0, 0.8, 1.0), wall), np.array([[0.0, 0.8, 1.0]]))
+    assert value_at(grid, 1.0, 0.8) == FREE and grid.cells.shape == (44, 44)
+
+
 def test_grid_without_sight_lines_is_free_where_the_camera_was():
     none = np.zeros((0, 3))
     lines = SightLines(none, none, np.zeros(0))
