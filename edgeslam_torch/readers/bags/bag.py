@@ -13,7 +13,7 @@ from typing import Any
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.extras import needs_extra
 from edgeslam_torch.files.time_units import MAX_STAMP_S
-from edgeslam_torch.readers.bags.limits import check_definition_text, check_types, readers
+from edgeslam_torch.readers.bags.limits import check_definition_text, check_message, check_types, readers
 from edgeslam_torch.readers.bags.mcap_file import McapFile, profile
 
 SUFFIXES = (".bag", ".db3", ".mcap")
@@ -40,6 +40,7 @@ _REMEDIES = (
     ("reindex", "it was not closed properly; repair it with: rosbag reindex"),
     ("index", "it was not closed properly; repair it with: rosbag reindex"),
     ("end magic", "it was not closed properly; repair it with: mcap recover"),
+    ("image is malformed", "its database is damaged; repair it with: sqlite3 DAMAGED.db3 .recover | sqlite3 NEW.db3"),
 )
 
 
@@ -145,6 +146,7 @@ class Bag:
         kind, _, is_ros1 = self._definitions[raw.topic]
         with self._no_damage(f"{self.path}: {raw.topic}"):
             store = self._store(raw.topic)
+            check_message(store.fielddefs, kind, raw.data, raw.topic)
             read = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
             return read(raw.data, kind)
 

@@ -25,6 +25,8 @@ _MAX_DEFINITION_CHARS = 1 << 16
 _MAX_FIELDS = 1000
 _MAX_NUMBERS, _MAX_ITEMS = 1 << 16, 1 << 10
 """Elements of a fixed array: of numbers, and of anything whose reading is unrolled."""
+_MAX_LISTED_BYTES = 1 << 22
+"""Of a message with arrays of messages or texts, which become Python objects, 70 times their bytes."""
 _SQL_STEPS = 100_000
 """Virtual-machine instructions between two looks at Ctrl-C: a few milliseconds."""
 _COMPUTED = "SELECT 1 FROM sqlite_schema AS t, pragma_table_xinfo(t.name) WHERE hidden > 1"
@@ -210,3 +212,29 @@ def check_types(types: Any, topic: str) -> None:
             numbers = not isinstance(inner, str) and base not in ("string", "wstring")
             if int(node) == 3 and not 0 < size <= (_MAX_NUMBERS if numbers else _MAX_ITEMS):
                 raise SourceError(f"{topic}: an array of {size} {base} in a message is not read")
+
+
+def check_message(types: Any, kind: str, data: Any, topic: str) -> None:
+    """Refuse a message of many bytes whose arrays would become objects rather than numbers.
+
+    Args:
+        types: As for `check_types`, which they have passed.
+        kind: The message's type.
+        data: Its bytes.
+        topic: For messages.
+
+    Raises:
+        SourceError: If it would take far more memory than its bytes.
+    """
+    if len(data) <= _MAX_LISTED_BYTES:
+        return
+    found, left = {kind}, [kind]
+    while left:
+        for _, (node, detail) in types[left.pop()][1]:
+            inner = detail[0][1] if int(node) in (3, 4) else detail
+            base = inner if isinstance(inner, str) else inner[0]
+            if int(node) in (3, 4) and (base == inner or base in ("string", "wstring")):
+                raise SourceError(f"{topic}: a message of {len(data)} bytes with a list of {base} is not read")
+            if isinstance(inner, str) and inner not in found:
+                found.add(inner)
+                left.append(inner)

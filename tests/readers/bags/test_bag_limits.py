@@ -11,7 +11,7 @@ import pytest
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.bags import limits
-from edgeslam_torch.readers.bags.limits import check_definition_text, check_types, chunk_bytes
+from edgeslam_torch.readers.bags.limits import check_definition_text, check_message, check_types, chunk_bytes
 from edgeslam_torch.readers.source import open_source
 
 pytest.importorskip("rosbags")
@@ -233,6 +233,20 @@ def test_sizes_constants_and_names_of_messages_are_bounded_before_they_reach_the
             check_types(each, "/x")
 
 
+@pytest.mark.parametrize("listed", ["a/C[]", "string[]", "a/D"])
+def test_lists_that_become_objects_are_refused_in_large_messages_alone(listed):
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    text = f"uint8[] data\n{listed} x\n{'=' * 80}\nMSG: a/C\nuint8 y\n{'=' * 80}\nMSG: a/D\na/C[2] y\n"
+    types = get_types_from_msg(text, "a/msg/B")
+    check_message(types, "a/msg/B", bytes(1000), "/x")
+    with pytest.raises(SourceError, match="/x: a message of 5000000 bytes with a list of"):
+        check_message(types, "a/msg/B", bytes(5_000_000), "/x")
+    known = get_typestore(Stores.LATEST).fielddefs
+    for kind in (IMAGE, "sensor_msgs/msg/CompressedImage", "nav_msgs/msg/Odometry"):
+        check_message(known, kind, bytes(5_000_000), "/x")
+
+
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("name", ["b.db3", "b.mcap"])
 def test_a_pipe_in_a_bags_folder_is_refused(tmp_path, name):
@@ -259,3 +273,11 @@ def test_sixteen_bits_of_a_thermal_camera_are_read_where_the_topic_is_named(tmp_
     image = next(iter(source.frames())).image
     assert image.dtype == np.uint8 and np.ptp(image.astype(int)) > 10
     assert any("16UC1" in problem.reason for problem in source.problems)
+
+
+def test_a_damaged_database_is_refused_with_the_remedy(tmp_path):
+    path = bags.write_ros2(tmp_path / "bag", _pictures(0, 20))
+    database = next(path.glob("*.db3"))
+    database.write_bytes(database.read_bytes()[:60_000])
+    with pytest.raises(SourceError, match=r"damaged; repair it with: sqlite3 .* \.recover"):
+        list(open_source(path).frames())
