@@ -2,24 +2,23 @@
 
 import re
 import threading
-from collections.abc import Callable, Iterator
-from importlib.util import find_spec
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeslam_torch.calibration.camera_choice import choose_camera
 from edgeslam_torch.drone.tello import StateMessage, Tello, TelloAddress, TelloError
-from edgeslam_torch.drone.video_stream import ArrivalClock, OneSize, Picture, import_av
+from edgeslam_torch.drone.video_stream import ArrivalClock, OneSize, Picture
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.gstreamer import SCHEME, GStreamerCapture
-from edgeslam_torch.readers.images import check_trackable, decode
+from edgeslam_torch.readers.images import check_trackable
 from edgeslam_torch.readers.listing import Problem
 from edgeslam_torch.readers.pace import Steps
+from edgeslam_torch.readers.streams.packets import decoded_here
 from edgeslam_torch.types import Frame, TelemetrySample
 
 FIRST_PICTURE_S = 10.0
@@ -32,10 +31,6 @@ _MAX_NAME = 60
 """Characters of an address in a folder's name."""
 _SLICE_S = 0.1
 """Polling interval of a waiting source."""
-_CODECS = {b"MJPG": "mjpeg", b"jpeg": "mjpeg", b"mjpg": "mjpeg"} | dict.fromkeys((b"\x1b\0\0\0", b"\7\0\0\0"), "h264")
-_CODECS |= dict.fromkeys((b"h264", b"H264", b"avc1"), "h264")
-_CODECS |= dict.fromkeys((b"hevc", b"hev1", b"hvc1", b"$\0\0\0"), "hevc")
-"""A stream's four letters, or the number of its kind in MPEG-TS and FLV."""
 
 
 class Feed(Protocol):
@@ -255,46 +250,6 @@ class Capture(Protocol):
         """Close."""
 
 
-class _Packets:
-    """A stream that is received by OpenCV and decoded here: OpenCV stretches all pictures to the first one's size."""
-
-    def __init__(self, capture: cv2.VideoCapture, codec: str) -> None:
-        capture.set(cv2.CAP_PROP_FORMAT, -1)
-        self._capture = capture
-        self._decode = _decode_jpeg if codec == "mjpeg" else _decoder(codec, capture)
-        self.release = capture.release
-
-    def read(self) -> tuple[bool, NDArray[np.uint8] | None]:
-        """As `Capture`."""
-        ok, packet = self._capture.read()
-        return (True, self._decode(packet.tobytes())) if ok else (False, None)
-
-
-def _decode_jpeg(packet: bytes) -> NDArray[np.uint8] | None:
-    try:
-        return np.asarray(decode(packet, "picture", cv2.IMREAD_COLOR), np.uint8)
-    except SourceError:
-        return None
-
-
-def _decoder(codec: str, capture: cv2.VideoCapture) -> Callable[[bytes], NDArray[np.uint8] | None]:
-    av = import_av()
-    context = av.CodecContext.create(codec, "r")
-    context.thread_count = 1  # frame threads would delay pictures
-    _, parameters = capture.retrieve(flag=int(capture.get(cv2.CAP_PROP_CODEC_EXTRADATA_INDEX)))
-    if parameters is not None and not any(parameters.ravel()[:2]):  # else they are MP4's and repeated in the packets
-        context.extradata = parameters.tobytes()
-
-    def newest(packet: bytes) -> NDArray[np.uint8] | None:
-        try:
-            frames = [frame for frame in context.decode(av.Packet(packet)) if not frame.is_corrupt]
-            return np.asarray(frames[-1].to_ndarray(format="bgr24")) if frames else None
-        except (av.error.FFmpegError, ValueError):
-            return None
-
-    return newest
-
-
 def _opened(device: int | str, name: str) -> Capture:
     if isinstance(device, str) and device.startswith(SCHEME):
         return GStreamerCapture(device)
@@ -307,10 +262,7 @@ def _opened(device: int | str, name: str) -> Capture:
     if not capture.isOpened():
         capture.release()
         raise SourceError(f"{name}: cannot be opened; is it there, and free?")
-    codec = _CODECS.get((int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little"))
-    if isinstance(device, int) or codec is None or (codec != "mjpeg" and find_spec("av") is None):
-        return capture
-    return _Packets(capture, codec)
+    return capture if isinstance(device, int) else decoded_here(capture) or capture
 
 
 def without_password(address: str) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.images import ASSUMED_HZ, check_size
 from edgeslam_torch.readers.listing import Problem
+from edgeslam_torch.readers.streams.packets import change_of_size
 from edgeslam_torch.types import Frame
 
 SUFFIXES = frozenset(
@@ -23,6 +24,8 @@ PREVIEWS = frozenset({".lrv"})
 """Small copies that GoPro cameras write beside their videos."""
 _RAW = frozenset({".h264", ".264", ".h265", ".265", ".hevc", ".mjpeg"})
 """Elementary streams, without times; FFmpeg assumes 25 frames a second."""
+_JOINED = _RAW | {".ts", ".mts", ".m2ts"}
+"""Streams that are joined by appending one to the other."""
 
 
 class Video:
@@ -55,7 +58,9 @@ class Video:
         self.size = (image.shape[1], image.shape[0])
 
     def frames(self, problems: list[Problem]) -> Iterator[Frame]:
-        """Frames with strictly increasing stamps; skipped ones are added to ``problems``."""
+        """Frames with strictly increasing stamps; skipped ones are added to ``problems``, and an end before pictures of
+        another size."""
+        change = change_of_size(_opened(self.path), self.size) if self.path.suffix.lower() in _JOINED else None
         capture = _opened(self.path)
         last, index, shown_s = -math.inf, -1, 0.0
         try:
@@ -64,6 +69,11 @@ class Video:
                 if not ok:
                     break
                 index += 1
+                if change is not None and index == change[0]:
+                    sizes = "{}x{} to {}x{}".format(*self.size, *change[1])
+                    reason = f"the resolution changes from {sizes} at frame {index}: ended there; cut the video there"
+                    problems.append(Problem(str(self.path), reason, change[2]))
+                    return
                 container_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
                 shown_s = 1e-3 * container_ms if math.isfinite(container_ms) else shown_s
                 stamp = self._stamp(index, container_ms)

@@ -1,0 +1,1 @@
+"""Coded pictures of streams."""
