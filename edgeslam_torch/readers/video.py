@@ -26,6 +26,9 @@ _RAW = frozenset({".h264", ".264", ".h265", ".265", ".hevc", ".mjpeg"})
 """Elementary streams, without times; FFmpeg assumes 25 frames a second."""
 _JOINED = _RAW | {".ts", ".mts", ".m2ts"}
 """Streams that are joined by appending one to the other."""
+_FIRST_BOXES = (b"ftyp", b"wide", b"mdat")
+_MAX_BOXES = 64
+"""Outermost parts of an MP4 that are looked at; there are about five."""
 
 
 class Video:
@@ -106,8 +109,27 @@ def _opened(path: Path) -> "cv2.VideoCapture":
         raise SourceError(f"{path}: empty file")
     # FFmpeg explicitly: OpenCV's other backends treat any file name with digits as an image sequence.
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    if not capture.isOpened() and _lacks_index(path):
+        raise SourceError(
+            f"{path}: cut off: it has no index; copy it again, or repair it in the camera or with an MP4 repair tool"
+        )
     if not capture.isOpened():
         raise SourceError(
             f"{path}: not a video that can be decoded; convert it to H.264 in .mp4, or to a folder of images"
         )
     return capture
+
+
+def _lacks_index(path: Path) -> bool:
+    """Whether it is an MP4 or MOV that ends before its index does (``moov``), which most cameras write last."""
+    length, at, kinds = path.stat().st_size, 0, list[bytes]()
+    with path.open("rb") as file:
+        while at < length and len(kinds) < _MAX_BOXES:
+            file.seek(at)
+            head = file.read(16)
+            kinds.append(head[4:8])
+            size = int.from_bytes(head[8:] if head[:4] == b"\0\0\0\1" else head[:4])
+            at = length if size < 8 else at + size  # 0: up to the file's end
+            if kinds[-1] == b"moov" and at <= length:
+                return False
+    return kinds[0] in _FIRST_BOXES

@@ -1,4 +1,4 @@
-"""Videos whose pictures change their size."""
+"""Videos whose pictures change their size, and damaged ones."""
 
 import io
 
@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.video import Video
 
 
@@ -20,8 +21,9 @@ def _coded(codec, form):
         clip = io.BytesIO()
         with av.open(clip, "w", format=form) as container:
             stream = container.add_stream(codec, rate=25, width=width, height=height, pix_fmt="yuv420p")
-            picture = av.VideoFrame.from_ndarray(np.full((height, width, 3), 90, np.uint8), format="bgr24")
-            for packet in [*(p for _ in range(count) for p in stream.encode(picture)), *stream.encode(None)]:
+            texture = cv2.resize(np.random.default_rng(0).integers(0, 255, (12, 16, 3), np.uint8), (width, height))
+            moving = (av.VideoFrame.from_ndarray(np.roll(texture, i, 1), format="bgr24") for i in range(count))
+            for packet in [*(p for picture in moving for p in stream.encode(picture)), *stream.encode(None)]:
                 container.mux(packet)
         return clip.getvalue()
 
@@ -58,3 +60,21 @@ def test_a_joined_video_of_one_resolution_is_read_to_its_end(tmp_path, suffix, s
     problems = []
     assert len(list(Video(path).frames(problems))) == 25
     assert problems == []
+
+
+@pytest.mark.parametrize(("suffix", "after"), [(".mp4", -40), (".mp4", -4), (".mov", 60)])
+def test_a_video_that_was_cut_off_before_its_index_ends_is_named_so(tmp_path, suffix, after):
+    whole = _coded("libx264", "mp4")(128, 96, 30)
+    path = tmp_path / f"cut{suffix}"
+    path.write_bytes(whole[: whole.index(b"moov") + after])
+    with pytest.raises(SourceError, match="cut off: it has no index; copy it again, or repair it") as refused:
+        Video(path)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("text", [b"not a video", b"\0\0\0\x08 and no moov in it", b"\0\0\0\x01moov"])
+def test_what_is_no_video_is_not_said_to_be_cut_off(tmp_path, text):
+    path = tmp_path / "text.mp4"
+    path.write_bytes(text)
+    with pytest.raises(SourceError, match="not a video that can be decoded"):
+        Video(path)
