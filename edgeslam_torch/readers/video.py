@@ -11,7 +11,7 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.images import ASSUMED_HZ, check_size
 from edgeslam_torch.readers.listing import Problem
 from edgeslam_torch.readers.streams.packets import change_of_size
-from edgeslam_torch.types import Frame
+from edgeslam_torch.types import FloatArray, Frame
 
 SUFFIXES = frozenset(
     f".{name}"
@@ -26,6 +26,8 @@ _RAW = frozenset({".h264", ".264", ".h265", ".265", ".hevc", ".mjpeg"})
 """Elementary streams, without times; FFmpeg assumes 25 frames a second."""
 _JOINED = _RAW | {".ts", ".mts", ".m2ts"}
 """Streams that are joined by appending one to the other."""
+_GAP = 4.5
+"""Usual steps between stamps from which on frames are missing, however the rate varies."""
 _FIRST_BOXES = (b"ftyp", b"wide", b"mdat")
 _MAX_BOXES = 64
 """Outermost parts of an MP4 that are looked at; there are about five."""
@@ -63,19 +65,21 @@ class Video:
     def frames(self, problems: list[Problem]) -> Iterator[Frame]:
         """Frames with strictly increasing stamps; skipped ones are added to ``problems``, and an end before pictures of
         another size."""
-        change = change_of_size(_opened(self.path), self.size) if self.path.suffix.lower() in _JOINED else None
+        is_joined = self.path.suffix.lower() in _JOINED
+        end, size, rest = change_of_size(_opened(self.path), self.size) if is_joined else (0, None, 0)
         capture = _opened(self.path)
         last, index, shown_s = -math.inf, -1, 0.0
+        steps_s: list[float] = []
         try:
             while True:
                 ok, image = capture.read()
                 if not ok:
                     break
                 index += 1
-                if change is not None and index == change[0]:
-                    sizes = "{}x{} to {}x{}".format(*self.size, *change[1])
+                if size is not None and index == end:
+                    sizes = "{}x{} to {}x{}".format(*self.size, *size)
                     reason = f"the resolution changes from {sizes} at frame {index}: ended there; cut the video there"
-                    problems.append(Problem(str(self.path), reason, change[2]))
+                    problems.append(Problem(str(self.path), reason, rest))
                     return
                 container_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
                 shown_s = 1e-3 * container_ms if math.isfinite(container_ms) else shown_s
@@ -84,6 +88,7 @@ class Video:
                     reason = "has no stamp" if stamp is None else f"stamp {stamp:.6f} does not increase"
                     problems.append(Problem(f"{self.path}, frame {index}", f"{reason}; image left out"))
                     continue
+                steps_s.append(stamp - last)
                 last = stamp
                 yield Frame(index, stamp, np.asarray(image, dtype=np.uint8), self.path)
         finally:
@@ -93,6 +98,13 @@ class Video:
         if self.count is not None and not whole:
             reason = f"decoding ended after {index + 1} of {self.count} frames; the file is damaged"
             problems.append(Problem(str(self.path), reason, self.count - index - 1))
+        elif index + 1 < 0.98 * end and not 0.49 * end <= index + 1 <= 0.51 * end:  # packets may be halves of pictures
+            reason = f"{index + 1} of {end} frames can be decoded; the file is damaged"
+            problems.append(Problem(str(self.path), reason, end - index - 1))
+        missing = _missing(np.array(steps_s[1:])) if is_joined and self.stamps_s is None else 0
+        if missing > 0:
+            reason = f"{missing} frames are missing by the stamps: the file is damaged, or was paused"
+            problems.append(Problem(str(self.path), reason, frames=0))
 
     def _stamp(self, index: int, container_ms: float) -> float | None:
         if self.stamps_s is not None:
@@ -100,6 +112,12 @@ class Video:
         if math.isfinite(container_ms) and (container_ms > 0.0 or index == 0):
             return container_ms * 1e-3
         return index / self.rate_hz
+
+
+def _missing(steps_s: FloatArray) -> int:
+    """How many frames gaps of many usual steps are long."""
+    usual_s = np.median(steps_s) if len(steps_s) > 0 else math.inf
+    return round(float(np.sum(steps_s[steps_s > _GAP * usual_s] / usual_s - 1.0)))
 
 
 def _opened(path: Path) -> "cv2.VideoCapture":

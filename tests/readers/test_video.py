@@ -78,3 +78,28 @@ def test_what_is_no_video_is_not_said_to_be_cut_off(tmp_path, text):
     path.write_bytes(text)
     with pytest.raises(SourceError, match="not a video that can be decoded"):
         Video(path)
+
+
+def _noisy(stream, first, last):
+    begin, end = int(first * len(stream)), int(last * len(stream))
+    return stream[:begin] + np.random.default_rng(0).bytes(end - begin) + stream[end:]
+
+
+def test_packets_of_a_stream_that_cannot_be_decoded_are_counted(tmp_path):
+    path = tmp_path / "noisy.hevc"
+    path.write_bytes(_noisy(_coded("libx265", "hevc")(320, 240, 100), 0.4, 0.6))
+    problems = []
+    given = len(list(Video(path).frames(problems)))
+    (problem,) = problems
+    assert problem.reason == f"{given} of {given + problem.frames} frames can be decoded; the file is damaged"
+    assert problem.frames > 2
+
+
+def test_pictures_that_are_missing_between_the_stamps_of_a_stream_are_said(tmp_path):
+    path = tmp_path / "noisy.ts"
+    path.write_bytes(_noisy(_coded("libx264", "mpegts")(320, 240, 100), 0.4, 0.6))
+    problems = []
+    given = len(list(Video(path).frames(problems)))
+    (missing,) = (int(p.reason.split()[0]) for p in problems if "frames are missing by the stamps" in p.reason)
+    assert given < 95
+    assert given + missing == pytest.approx(100, abs=5)

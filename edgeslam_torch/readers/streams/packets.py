@@ -79,9 +79,9 @@ def _decoder(codec: str, capture: cv2.VideoCapture) -> Callable[[bytes], NDArray
     return newest
 
 
-def change_of_size(packets: cv2.VideoCapture, size: tuple[int, int]) -> tuple[int, tuple[int, int], int] | None:
-    """Index and size of the first picture of another size, and how many pictures there are from it on; None if there is
-    none, and for other codings than those of `codec_of`.
+def change_of_size(packets: cv2.VideoCapture, size: tuple[int, int]) -> tuple[int, tuple[int, int] | None, int]:
+    """Index and size of the first picture of another size, and how many pictures there are from it on; without one, the
+    number of all pictures, None, 0; with other codings than those of `codec_of`, 0, None, 0.
 
     Args:
         packets: A video, which is read to its end and released.
@@ -107,7 +107,7 @@ def change_of_size(packets: cv2.VideoCapture, size: tuple[int, int]) -> tuple[in
             index += 1
     finally:
         packets.release()
-    return None
+    return index, None, 0
 
 
 def _size_of(packet: bytes, suffix: str) -> tuple[int, int] | None:
