@@ -3,8 +3,7 @@
 The map itself is never rescaled. Its units are published as they are until reliable sensors contradict them. A revision
 rescales about the origin, where the flight began: positions after it are right at once, and those published before
 carry the revision of their unit. The axes are revised likewise: once the attitude is known, and again where a validated
-one finds them off, as after a bent take-off. Final
-results without telemetry are levelled by `mapping/level/`.
+one finds them off, as after a bent take-off. Final results without telemetry are levelled by `mapping/level/`.
 """
 
 import math
@@ -91,7 +90,7 @@ class OutputFrame:
         """
         if R_w_m is None or self.is_earlier:
             return self
-        leans_rad = math.acos(min(float(self.R[2] @ R_w_m[2]), 1.0))
+        leans_rad = math.acos(float(np.clip(self.R[2] @ R_w_m[2], -1.0, 1.0)))
         if self.upright and not (validated and leans_rad > _LEANS_RAD):
             return self
         return replace(self.levelled(R_w_m[2]), revision=self.revision + 1, upright=True)

@@ -80,6 +80,14 @@ def test_a_validated_attitude_levels_a_map_again_where_it_leans_clearly(leans_de
         np.testing.assert_allclose(new.R @ R_w_m[2], [0.0, 0.0, 1.0], atol=1e-9)
 
 
+def test_a_world_that_is_exactly_upside_down_is_turned(rng):
+    """The cosine of its lean is -1, or by rounding a little less."""
+    for _ in range(20):
+        R = small_motion(rng, 0, 1.0)[:3, :3]
+        turned = OutputFrame(1.0, R, upright=True).turned_upright(np.diag([1.0, -1.0, -1.0]) @ R, True)
+        np.testing.assert_allclose(turned.R[2], -R[2], atol=1e-9)
+
+
 @pytest.mark.parametrize(("value", "sigma", "published"), [(5.0, 0.25, 4.4), (0.2, 0.02, 0.22)])
 def test_contradiction_does_not_depend_on_the_maps_units(value, sigma, published):
     """12.8 % off where 5 % are stated; 9.5 % off where 10 % are."""
