@@ -1,6 +1,6 @@
 """Real recordings through the whole system, default settings: the bars of a release."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -64,7 +64,7 @@ def test_sequence_is_within_its_bar(data_dir, tmp_path, name):
 )
 def test_telemetry_that_is_wrong_does_not_bend_the_map(data_dir, tmp_path, fault, seed, ate_m):
     (cell,) = list_cells(data_dir, "all", [seed], [f"telemetry/{fault}"])
-    arguments = {"cell": cell.to_dict(), "overrides": [], "max_frames": None, "flights": str(tmp_path)}
+    arguments = {"cell": asdict(cell), "overrides": [], "max_frames": None, "flights": str(tmp_path)}
     figures = run_cell(arguments, tmp_path / "out")["figures"]
     assert figures["ate_m"] < ate_m and figures["supported_end"] > 0.95
 

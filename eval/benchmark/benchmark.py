@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,13 +20,12 @@ import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.conditions import code_state, machine, orb_pass_ms, stamp
-from edgeslam_torch.eval.experiment.figures import Figure, grouped, markdown_table
-from edgeslam_torch.eval.experiment.runner import MODULE, Local, Task, is_experiment, run_tasks
+from edgeslam_torch.eval.experiment.figures import Figure, grouped, markdown_table, plain
+from edgeslam_torch.eval.experiment.runner import MODULE, Local, Task, check_own, run_all
 from edgeslam_torch.eval.inputs.dataset import find_recordings
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.jobs.watched import Limits, start_module
-from edgeslam_torch.writers.own_folder import check_free
 
 FORMAT = 3
 """Of a record; earlier ones had no figure of CPU time in passes of ORB."""
@@ -96,18 +95,14 @@ def sequences(settings: BenchSettings, others: Sequence[str] = ()) -> dict[str, 
 
 
 def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    """Run everything into ``out``, write ``bench.json`` there and return what it holds.
-
-    Args:
-        settings: What is run.
-        out: Folder of the runs; those with the same code and settings that it holds are not repeated.
-        say: Called with one line after every run.
+    """Run everything into ``out``, write ``bench.json`` there and return what it holds; runs with the same code and
+    settings that it holds are not repeated.
 
     Raises:
         EvaluationError: If a named sequence is not there.
         OutputError: If ``out`` holds what no benchmark wrote.
     """
-    check_own(out, "bench.json", ("format", "runs"))
+    check_own(out, CASES, ("format", "runs"), "bench.json")
     begin = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
     folders = sequences(settings, (SYNTHETIC,))
@@ -126,19 +121,14 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
     return record
 
 
-def check_own(out: Path, record: str = "", keys: Collection[str] = ()) -> None:
-    """Check that a benchmark may write its cases into a folder, and its record, if it has one, with such keys.
-
-    Raises:
-        OutputError: If they would replace what none wrote.
-    """
-    check_free(out, (CASES, record or CASES), lambda folder: is_experiment(folder, CASES, record, keys))
-
-
 def asked(settings: BenchSettings) -> dict[str, Any]:
     """Settings of a record, in words."""
     seeds, overrides = list(settings.seeds), list(settings.overrides)
     return {"seeds": seeds, "max_frames": settings.max_frames, "overrides": overrides}
+
+
+Key = tuple[str, int, str]
+"""Of a run: sequence, seed and the row of settings."""
 
 
 def run_rows(
@@ -158,9 +148,9 @@ def run_rows(
         say: Called with one line after every run.
 
     Returns:
-        Runs of each row: sequence, seed, figures, what else `run_sequence` found, and why there is none.
+        Runs of each row: sequence, seed, what `run_sequence` found, and why there is nothing.
     """
-    commit, tasks = code_state(), {}
+    commit, tasks = code_state(), dict[Key, Task]()
     for name, folder in folders.items():
         for seed in settings.seeds:
             for row, (overrides, first) in rows.items():
@@ -172,17 +162,13 @@ def run_rows(
                 function = f"{__name__}:run_sequence"
                 tasks[name, seed, row] = Task(out / CASES, own, function, case, {"out": str(out / own)})
     start = partial(start_module, MODULE, environment={})  # threads as the user's own runs have them
-    found = {}
-    for key, result, ended in run_tasks(tasks, Local(1, Limits(_RUN_TIMEOUT_S), start=start)):
-        run: dict[str, Any] = {"sequence": key[0], "seed": key[1], "figures": {}, "stages": {}, "error": ""}
-        if result is not None:
-            run |= {name: value for name, value in result.items() if name != "key"}
-        elif ended is not None:
-            run["error"] = ended.reason.removesuffix(" (exit code 1)")
-        found[key] = run
-        if ended is not None:
-            say(f"{key[0]}, seed {key[1]}{f', {key[2]}' if key[2] else ''}: {_one_line(run)}")
+    found = run_all(tasks, Local(1, Limits(_RUN_TIMEOUT_S), start=start), _run, _one_line, say)
     return {row: [found[key] for key in tasks if key[2] == row] for row in rows}
+
+
+def _run(key: Key, found: dict[str, Any] | None, error: str) -> dict[str, Any]:
+    run = {"sequence": key[0], "seed": key[1], "figures": {}, "stages": {}}
+    return run | (found or {}) | {"error": error.removesuffix(" (exit code 1)")}
 
 
 def run_sequence(case: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -226,10 +212,9 @@ def figures_of(score: RunScore) -> dict[str, float | None]:
         **{name: summary.get(name) for name in ("fps", "cpu_ms_per_frame", "peak_rss_mb", "dropped_frames")},
         "finish_ms": 1e3 * summary["finish_s"] if "finish_s" in summary else None,
     }
-    if score.map is not None:
-        found = score.map
+    if (found := score.map) is not None:
         own |= {
-            "map_points": float(found.points),
+            "map_points": found.points,
             "map_median_m": found.median_m,
             "map_single_median_m": found.single_map_median_m,
             "map_own_alignment_median_m": found.own_alignment_median_m,
@@ -238,7 +223,7 @@ def figures_of(score: RunScore) -> dict[str, float | None]:
             "edges_within_2cm": found.completeness.get(0.02),
             "edges_within_6cm": found.completeness.get(0.06),
         }
-    return {k: float(v) if v is not None and np.isfinite(v) else None for k, v in own.items()}
+    return plain(own)
 
 
 def _record_synthetic(out: Path, settings: BenchSettings, say: Callable[[str], None]) -> Path:
@@ -256,11 +241,12 @@ def _record_synthetic(out: Path, settings: BenchSettings, say: Callable[[str], N
     return flight
 
 
-def _one_line(run: dict[str, Any]) -> str:
+def _one_line(key: Key, run: dict[str, Any]) -> str:
+    name = f"{key[0]}, seed {key[1]}{f', {key[2]}' if key[2] else ''}"
     if run["error"]:
-        return f"failed: {run['error']}"
+        return f"{name}: failed: {run['error']}"
     f = run["figures"]
-    text = f"ATE {f['ate_sim3_m']:.4f} m, coverage {f['coverage']:.1%}"
+    text = f"{name}: ATE {f['ate_sim3_m']:.4f} m, coverage {f['coverage']:.1%}"
     if f.get("map_median_m") is not None:
         text += f", map {f['map_points']:.0f} points, {f['map_median_m']:.4f} m"
     return text + (f", {f['cpu_ms_per_frame']:.0f} ms CPU per frame" if f.get("cpu_ms_per_frame") else "")

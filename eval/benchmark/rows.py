@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edgeslam_torch.eval.benchmark.benchmark import FIGURES, BenchSettings, asked, check_own, run_rows, sequences
+from edgeslam_torch.eval.benchmark.benchmark import CASES, FIGURES, BenchSettings, asked, run_rows, sequences
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.conditions import machine, stamp
-from edgeslam_torch.eval.experiment.figures import Figure, changes, grouped, markdown_table
+from edgeslam_torch.eval.experiment.figures import Figure, grouped, markdown_table
+from edgeslam_torch.eval.experiment.runner import check_own
 from edgeslam_torch.files.atomic import write_text
 
 RECORD = "ablation.json"
@@ -47,22 +48,19 @@ _NETWORKS = tuple(f for f in FIGURES if f.name in _SHOWN and f.name not in ("ate
 def run_ablation(
     settings: BenchSettings, names: Sequence[str], out: Path, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Run every sequence with every seed and row; runs that an earlier call left in ``out`` are not repeated.
+    """Run every sequence with every seed and row, and write ``ablation.json``; runs that ``out`` has are not repeated.
 
     Args:
         settings: What is run.
         names: Of `ROWS`; all when empty. The rows they are compared with are run too.
-        out: Folder of ``ablation.json``.
+        out: Folder of the results.
         say: Called with one line for every run.
-
-    Returns:
-        The record: conditions, and for every row by name its runs with their figures.
 
     Raises:
         EvaluationError: If a row or a sequence does not exist.
         OutputError: If ``out`` holds what no ablation wrote.
     """
-    check_own(out, RECORD, ("machine", "settings", "rows"))
+    check_own(out, CASES, ("machine", "settings", "rows"), RECORD)
     unknown = [name for name in names if name not in ROWS]
     if unknown:
         raise EvaluationError(f"no row {unknown[0]!r}; there are {', '.join(ROWS)}")
@@ -108,9 +106,8 @@ def markdown_ablation(record: dict[str, Any]) -> str:
 
 
 def _verdict(before: dict[str, Any], after: dict[str, Any], sequence: str) -> str:
-    found = changes({sequence: before[sequence]}, {sequence: after[sequence]}, JUDGED)
-    told = [f"{f.title.split(' [')[0]} {found[sequence, f.name]}" for f in JUDGED if (sequence, f.name) in found]
-    return ", ".join(text for text in told if not text.endswith(" same")) or "same"
+    found = {f.title.split(" [")[0]: f.change(before[sequence], after[sequence]) for f in JUDGED}
+    return ", ".join(f"{title} {change}" for title, change in found.items() if change not in ("", "same")) or "same"
 
 
 def compare_networks(
@@ -121,7 +118,7 @@ def compare_networks(
     Raises:
         OutputError: If ``out`` holds what no benchmark wrote.
     """
-    check_own(out)
+    check_own(out, CASES)
     rows = {str(number): ((f"depth.weights={network}",), "") for number, network in enumerate(networks)}
     found = run_rows(settings, sequences(settings), rows, out, say)
     return {network: {"runs": runs} for network, runs in zip(networks, found.values(), strict=True)}

@@ -74,10 +74,22 @@ class Figure:
             return "same"
         return "better" if (change < 0) == self.lower_is_better else "worse"
 
+    def change(self, before: Sequence[Run], after: Sequence[Run]) -> str:
+        """The verdict on runs; empty where the first have no such figure or it is not compared."""
+        a, b = self.values(before), self.values(after)
+        if not a or self.floor is None:
+            return ""
+        return self.verdict(a, b) if b else "worse"  # what there is no more is worse
+
 
 def _scatter(values: Sequence[float]) -> float:
     """Sample standard deviation; 0 of a single value."""
     return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+
+def plain(figures: Mapping[str, Any]) -> dict[str, float | None]:
+    """For JSON: numbers, and None for what is missing or not finite."""
+    return {name: float(v) if v is not None and np.isfinite(v) else None for name, v in figures.items()}
 
 
 def grouped(runs: Sequence[Run], key: str) -> dict[str, list[Run]]:
@@ -85,20 +97,9 @@ def grouped(runs: Sequence[Run], key: str) -> dict[str, list[Run]]:
     return {name: [run for run in runs if run[key] == name] for name in dict.fromkeys(run[key] for run in runs)}
 
 
-def changes(before: Groups, after: Groups, figures: Sequence[Figure]) -> dict[tuple[str, str], str]:
-    """Verdict on every compared figure of every name that both have, by name and the figure's name."""
-    found = {}
-    for name in (n for n in after if n in before):
-        for figure in (f for f in figures if f.floor is not None):
-            a, b = figure.values(before[name]), figure.values(after[name])
-            if a:  # what there is no more is worse
-                found[name, figure.name] = figure.verdict(a, b) if b else "worse"
-    return found
-
-
 def markdown_comparison(before: Groups, after: Groups, figures: Sequence[Figure]) -> str:
     """Medians of both and their ratio, a line for every name, ``!`` where it got worse and ``+`` where better."""
-    found, compared = changes(before, after, figures), [figure for figure in figures if figure.floor is not None]
+    compared = [figure for figure in figures if figure.floor is not None]
     names = [name for name in after if name in before]
     worse = []
     lines = []
@@ -108,7 +109,7 @@ def markdown_comparison(before: Groups, after: Groups, figures: Sequence[Figure]
             a, b = figure.values(before[name]), figure.values(after[name])
             first, second = (float(np.median(values)) if values else 0.0 for values in (a, b))
             ratio = f" x{second / first:.2f}" if figure.relative and b and first > 0 else ""
-            verdict = found.get((name, figure.name), "")
+            verdict = figure.change(before[name], after[name])
             mark = {"worse": " !", "better": " +"}.get(verdict, "")
             line.append(f"{figure.cell(a)} -> {figure.cell(b)}{ratio}{mark}" if a or b else "-")
             if verdict == "worse":
@@ -127,15 +128,7 @@ def markdown_comparison(before: Groups, after: Groups, figures: Sequence[Figure]
 def compared(
     before: Mapping[str, Any], after: Mapping[str, Any], rows: str, name: str, figures: Sequence[Figure]
 ) -> str:
-    """Two records side by side, and what to beware of.
-
-    Args:
-        before: A record.
-        after: Another one.
-        rows: Key of a record's runs.
-        name: Key of a run's source.
-        figures: What is compared.
-    """
+    """Two records side by side, and what to beware of; ``rows`` is the key of the runs, ``name`` of a run's source."""
     head = f"{before.get('commit')} -> {after.get('commit')}, medians, ratio; ! worse, + better by more than the noise"
     table = markdown_comparison(grouped(before[rows], name), grouped(after[rows], name), figures)
     return "\n".join([head, *other_conditions(before, after), "", table])

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Protocol, TypeVar
+from typing import IO, Any, TypeVar
 
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.errors import EvaluationError
@@ -23,10 +23,12 @@ from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.plain import subfolder
 from edgeslam_torch.files.record_files import is_record, read_mapping
 from edgeslam_torch.jobs.watched import Ended, Job, Limits, Start, end_with_parent, run_each, start_module
+from edgeslam_torch.writers.own_folder import check_free
 
 MODULE = "edgeslam_torch.eval.experiment.runner"
 CASE, RESULT, LOG = "case.json", "result.json", "log.txt"
 T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +62,7 @@ class Task:
             found = read_mapping(self.folder / RESULT, "JSON", EvaluationError)
         except EvaluationError:
             return None
-        return found if found.get("key") == self.key else None
+        return found if found.pop("key", None) == self.key else None
 
     def prepare(self) -> Path:
         """The folder, with what the process has to do and no result."""
@@ -71,30 +73,25 @@ class Task:
         return folder
 
 
-def is_experiment(out: Path, cases: str, record: str = "", keys: Collection[str] = ()) -> bool:
-    """Whether an experiment wrote into a folder: its record, or while there is none its cases.
+def check_own(out: Path, cases: str, keys: Collection[str] = (), *names: str) -> None:
+    """Check that an experiment may write its cases' folder and ``names`` into ``out``; what marks such a folder as its
+    own is the first of them, a record with ``keys``, or while there is none its cases.
 
-    Args:
-        out: The folder.
-        cases: Name of the folder of the cases' folders in it.
-        record: Name of the record in it.
-        keys: What such a record has.
+    Raises:
+        OutputError: If it would replace what no such experiment wrote.
     """
-    if record and os.path.lexists(out / record):
-        return is_record(out / record, keys)
-    return any(is_record(case, ("key", "run")) for case in (out / cases).glob(f"*/{CASE}"))
+
+    def is_ours(folder: Path) -> bool:
+        if keys and os.path.lexists(folder / names[0]):
+            return is_record(folder / names[0], keys)
+        return any(is_record(case, ("key", "run")) for case in (folder / cases).glob(f"*/{CASE}"))
+
+    check_free(out, (*names, cases), is_ours)
 
 
-class Runner(Protocol):
-    """Runs cases, on this machine or on others."""
-
-    def __call__(self, cases: Iterable[T], prepare: Callable[[T], Path]) -> Generator[tuple[T, Ended]]:
-        """Cases with the ends of their processes, as they come; closing it ends what still runs.
-
-        Args:
-            cases: What to run.
-            prepare: Makes the folder of a case, called right before it is run.
-        """
+Runner = Callable[[Iterable[Any], Callable[[Any], Path]], Generator[tuple[Any, Ended]]]
+"""Runs cases, whose folders the second argument makes, here or elsewhere: cases with the ends of their processes, as
+they come; closing it ends what still runs."""
 
 
 def start_case(folder: Path, log: IO[str]) -> subprocess.Popen[str]:
@@ -136,6 +133,22 @@ def run_tasks(tasks: Mapping[T, Task], runner: Runner) -> Generator[tuple[T, dic
     with closing(runner(waiting, lambda case: tasks[case].prepare())) as ends:
         for case, ended in ends:
             yield case, tasks[case].result(), ended
+
+
+def run_all(
+    tasks: Mapping[T, Task],
+    runner: Runner,
+    row: Callable[[T, dict[str, Any] | None, str], R],
+    line: Callable[[T, R], str],
+    say: Callable[[str], None],
+) -> dict[T, R]:
+    """A row for each case, of its result or of the reason why there is none; a line is said for those run now."""
+    rows: dict[T, R] = {}
+    for case, found, ended in run_tasks(tasks, runner):
+        rows[case] = row(case, found, ended.reason if found is None and ended is not None else "")
+        if ended is not None:
+            say(f"[{len(rows)}/{len(tasks)}] {line(case, rows[case])}")
+    return rows
 
 
 def main(folder: Path) -> int:

@@ -1,6 +1,6 @@
 """Two trajectories on one clock in seconds, their association by time, and common mistakes in time stamps."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,21 +16,6 @@ SINCE_1970_S = 1e6
 
 _MIN_SHARE = 0.1
 """Two files of one recording pair at least this share of the poses that they could."""
-
-
-@dataclass(frozen=True, slots=True)
-class Association:
-    """Matched pairs of two lists of stamps."""
-
-    truth: IntArray
-    """``(M,)`` indices into the true stamps."""
-    estimate: IntArray
-    """``(M,)`` indices into the estimated stamps."""
-    offset_s: float = 0.0
-    """Added to the estimated stamps before matching."""
-
-    def __len__(self) -> int:
-        return len(self.truth)
 
 
 def nearest(stamps_s: FloatArray, queries_s: FloatArray) -> IntArray:
@@ -57,34 +42,24 @@ def match(truth_s: FloatArray, estimate_s: FloatArray, max_dt_s: float = DEFAULT
 
 
 def associate(
-    truth_s: FloatArray,
-    estimate_s: FloatArray,
-    max_dt_s: float = DEFAULT_MAX_DT_S,
-    offset_s: float = 0.0,
-) -> Association:
-    """Match estimated to true stamps.
-
-    Args:
-        truth_s: True stamps ``(N,)`` [s], increasing.
-        estimate_s: Estimated stamps ``(M,)`` [s], increasing.
-        max_dt_s: Largest time between matched poses [s].
-        offset_s: Added to the estimated stamps [s].
+    truth_s: FloatArray, estimate_s: FloatArray, max_dt_s: float = DEFAULT_MAX_DT_S
+) -> tuple[IntArray, IntArray]:
+    """`match`, of two trajectories of one recording.
 
     Raises:
         EvaluationError: If hardly anything matches; the message names the likely mistake.
     """
-    stamps = estimate_s + offset_s
-    i, j = match(truth_s, stamps, max_dt_s)
+    i, j = match(truth_s, estimate_s, max_dt_s)
     if len(i) == 0:
-        raise EvaluationError(_why_nothing_matches(truth_s, stamps, max_dt_s))
-    possible = possible_pairs(truth_s, stamps)
+        raise EvaluationError(_why_nothing_matches(truth_s, estimate_s, max_dt_s))
+    possible = possible_pairs(truth_s, estimate_s)
     if len(i) < _MIN_SHARE * possible:
-        gap = _typical_distance_s(truth_s, stamps)
+        gap = _typical_distance_s(truth_s, estimate_s)
         raise EvaluationError(
             f"only {len(i)} of {possible} poses have a match within {max_dt_s:g} s, typically {gap:.3f} s apart: "
             "another unit of time, an --offset, or a larger --max-dt"
         )
-    return Association(i, j, offset_s)
+    return i, j
 
 
 def possible_pairs(truth_s: FloatArray, estimate_s: FloatArray) -> int:

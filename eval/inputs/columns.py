@@ -74,12 +74,7 @@ def columns_by_name(names: Sequence[str]) -> Columns | None:
 
 
 def columns_by_number(count: int, euroc: bool) -> Columns | None:
-    """Columns of a table without header; None if no format has as many.
-
-    Args:
-        count: Number of columns.
-        euroc: Whether its name is that of an EuRoC file: the scalar part of a quaternion comes first there.
-    """
+    """Columns of a table without header; None if no format has as many. EuRoC's quaternions begin with the scalar."""
     if count == 4:
         return POSITIONS
     if count == 8:

@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -101,10 +101,6 @@ class Cell:
     def slug(self) -> str:
         """Name of its folder."""
         return f"{self.name.replace('/', '__')}-s{self.seed}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
 
 
 def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequence[str] = ()) -> list[Cell]:

@@ -1,17 +1,16 @@
 """The judge: all cells in processes of their own, and one record of their figures; an interrupted judge resumes."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.experiment.conditions import code_state, stamp
-from edgeslam_torch.eval.experiment.runner import CASE, Local, Runner, Task, is_experiment, run_tasks
+from edgeslam_torch.eval.experiment.runner import CASE, Local, Runner, Task, check_own, run_all
 from edgeslam_torch.eval.judge.cells import Cell
 from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.jobs.watched import Limits
-from edgeslam_torch.writers.own_folder import check_free
 
 RECORD, TABLE = "judge.json", "judge.md"
 FORMAT = 1
@@ -48,7 +47,7 @@ def judge(
     Args:
         cells: What to run.
         settings: How.
-        out: Folder for the cells' own folders.
+        out: Folder of the results.
         say: Called with one line for every finished cell.
         commit: State of the code; read from git when None. A result of another state is not taken.
         runner: `Local` when None.
@@ -60,38 +59,22 @@ def judge(
     Raises:
         OutputError: If ``out`` holds what no judge wrote.
     """
-    names = (RECORD, TABLE, CELLS, COMMANDS)
-    check_free(out, names, lambda folder: is_experiment(folder, CELLS, RECORD, ("format", "rows")))
+    check_own(out, CELLS, ("format", "rows"), RECORD, TABLE, COMMANDS)
     commit = code_state() if commit is None else commit
     flights = settings.flights or out / "flights"
     flights.mkdir(parents=True, exist_ok=True)
+    how = {"overrides": list(settings.overrides), "max_frames": settings.max_frames}
 
     def task(cell: Cell) -> Task:
-        case: dict[str, Any] = {
-            "commit": commit,
-            "overrides": list(settings.overrides),
-            "max_frames": settings.max_frames,
-        }
-        case |= {"cell": cell.to_dict()}
-        return Task(
-            out / CELLS, cell.slug, "edgeslam_torch.eval.judge.run_cell:run_cell", case, {"flights": str(flights)}
-        )
+        case = {"commit": commit, **how, "cell": asdict(cell)}
+        run = "edgeslam_torch.eval.judge.run_cell:run_cell"
+        return Task(out / CELLS, cell.slug, run, case, {"flights": str(flights)})
 
     runner = runner or Local(settings.jobs, Limits(settings.timeout_s))
-    rows: dict[Cell, dict[str, Any]] = {}
-    for cell, found, ended in run_tasks({cell: task(cell) for cell in cells}, runner):
-        rows[cell] = _row(cell, found or {"error": ended.reason if ended is not None else ""})
-        if ended is not None:
-            say(f"[{len(rows)}/{len(cells)}] {_one_line(rows[cell])}")
+    rows = run_all({cell: task(cell) for cell in cells}, runner, _row, _one_line, say)
     others = [cell for cell in _cells_in(out) if cell not in rows]
     rows |= {cell: _row(cell, found) for cell in others if (found := task(cell).result()) is not None}
-    return {
-        "format": FORMAT,
-        **stamp(commit),
-        "overrides": list(settings.overrides),
-        "max_frames": settings.max_frames,
-        "rows": sorted(rows.values(), key=_order),
-    }
+    return {"format": FORMAT, **stamp(commit), **how, "rows": sorted(rows.values(), key=_order)}
 
 
 def _order(row: dict[str, Any]) -> tuple[bool, str, int]:
@@ -110,19 +93,14 @@ def _cells_in(out: Path) -> list[Cell]:
     return cells
 
 
-def _row(cell: Cell, found: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "cell": cell.name,
-        "base": cell.base,
-        "seed": cell.seed,
-        "figures": found.get("figures", {}),
-        "notes": found.get("notes", []),
-        "error": found.get("error", ""),
-    }
+def _row(cell: Cell, found: dict[str, Any] | None, error: str = "") -> dict[str, Any]:
+    found = {"figures": {}, "notes": []} | (found or {})
+    own = {"cell": cell.name, "base": cell.base, "seed": cell.seed}
+    return own | {"figures": found["figures"], "notes": found["notes"], "error": error}
 
 
-def _one_line(row: dict[str, Any]) -> str:
-    name = f"{row['cell']} seed {row['seed']}"
+def _one_line(cell: Cell, row: dict[str, Any]) -> str:
+    name = f"{cell.name} seed {cell.seed}"
     if row["error"]:
         return f"{name}: {row['error']}"
     f = row["figures"]

@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.experiment.figures import Figure
+from edgeslam_torch.eval.experiment.figures import Figure, plain
 from edgeslam_torch.eval.inputs.associate import match
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, open_run
-from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
-from edgeslam_torch.eval.metrics.align import rms
+from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
+from edgeslam_torch.eval.metrics.align import rms, travelled
 from edgeslam_torch.eval.metrics.run_figures import at_end, live, live_figures, returns
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
-from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore
 from edgeslam_torch.geometry.camera_file import load_camera
 from edgeslam_torch.types import FloatArray
 
@@ -28,6 +27,7 @@ _BEGIN_S = 1.0
 """Length of a run's beginning."""
 
 Figures = dict[str, float | None]
+Surfaces = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,24 +38,8 @@ class Truth:
     """Data set folder or trajectory file; None when there is nothing to compare with."""
     depth: Path | None = None
     """Data set whose depth maps judge the map."""
-    surfaces: Callable[[FloatArray], FloatArray] | None = None
+    surfaces: Surfaces | None = None
     """Distances ``(N,)`` [m] of points ``(N, 3)`` to the surfaces of a simulated world, instead of depth maps."""
-
-    def trajectory(self) -> Trajectory:
-        """True poses."""
-        assert self.poses is not None
-        return open_dataset(self.poses).truth if self.poses.is_dir() else read_trajectory(self.poses)
-
-
-@dataclass(frozen=True, slots=True)
-class Judged:
-    """What the metrics of a run with ground truth are computed from."""
-
-    run: RunFolder
-    truth: Truth
-    poses: Trajectory
-    score: RunScore
-    sim3: TrajectoryScore
 
 
 def score(run_dir: Path, truth: Truth) -> tuple[Figures, list[str]]:
@@ -71,15 +55,14 @@ def score(run_dir: Path, truth: Truth) -> tuple[Figures, list[str]]:
         judge_map = truth.surfaces is None and truth.depth is not None
         try:
             found = evaluate_run(run.path, truth.poses, truth.depth, judge_map=judge_map, thresholds_m=MAP_THRESHOLDS_M)
-            assert found.sim3 is not None
-            judged = Judged(run, truth, truth.trajectory(), found, found.sim3)
             for metric in METRICS:
-                figures |= metric(judged)
+                figures |= metric(run, found)
+            figures |= _map(run, found, truth.surfaces)
             notes += [found.map_note] if judge_map and found.map is None else []
         except EvaluationError as error:
             notes.append(str(error).removeprefix(f"{run.trajectory.source}: "))
-            figures |= _standing_still(run, truth)
-    return {k: float(v) if v is not None and np.isfinite(v) else None for k, v in figures.items()}, notes
+            figures |= _standing_still(run, truth.poses)
+    return plain(figures), notes
 
 
 def _own_figures(run: RunFolder) -> dict[str, Any]:
@@ -114,8 +97,8 @@ def _own_sigma(run: RunFolder) -> float | None:
     return float(scale["sigma"]) / float(scale["value"]) if scale.get("sigma") else None
 
 
-def _trajectory(judged: Judged) -> dict[str, Any]:
-    found, path_m = judged.score, judged.sim3.truth_path_m
+def _trajectory(_: RunFolder, found: RunScore) -> dict[str, Any]:
+    path_m = found.sim3.truth_path_m
     return {
         "ate_m": found.ate_sim3_m,
         "online_m": found.ate_online_sim3_m,
@@ -132,26 +115,26 @@ def _percent(error_m: float, path_m: float) -> float | None:
     return 100.0 * error_m / path_m if path_m > 0 else None
 
 
-def _scale(judged: Judged) -> dict[str, Any]:
-    scale, sigma = judged.sim3.scale, _own_sigma(judged.run)
-    found = {"scale": scale if judged.score.units == "metres" else None, "scale_sim3": scale}
+def _scale(run: RunFolder, score: RunScore) -> dict[str, Any]:
+    scale, sigma = score.sim3.scale, _own_sigma(run)
+    found = {"scale": scale if score.units == "metres" else None, "scale_sim3": scale}
     if sigma is None or scale <= 0:
         return found | dict.fromkeys(("scale_z", "scale_off", "scale_sigmas"))
     off = np.log(scale)
     return found | {"scale_z": off / sigma, "scale_off": abs(off), "scale_sigmas": abs(off) / sigma}
 
 
-def _beginning(judged: Judged) -> dict[str, Any]:
+def _beginning(_: RunFolder, score: RunScore) -> dict[str, Any]:
     """RMS error of the first second's poses [m], and its ratio to that of the others."""
-    first = judged.sim3.stamps_s < judged.sim3.stamps_s[0] + _BEGIN_S
+    first = score.sim3.stamps_s < score.sim3.stamps_s[0] + _BEGIN_S
     if first.all():
         return {"first_m": None, "first_over_rest": None}
-    begin, rest = (float(np.sqrt(np.mean(judged.sim3.error_m[k] ** 2))) for k in (first, ~first))
+    begin, rest = (float(np.sqrt(np.mean(score.sim3.error_m[k] ** 2))) for k in (first, ~first))
     return {"first_m": begin, "first_over_rest": begin / rest if rest > 0 else None}
 
 
-def _map(judged: Judged) -> dict[str, Any]:
-    found, surfaces, cloud = judged.score.map, judged.truth.surfaces, judged.run.cloud()
+def _map(run: RunFolder, score: RunScore, surfaces: Surfaces | None) -> dict[str, Any]:
+    found, cloud = score.map, run.cloud()
     if found is not None:
         return {
             "map_median_m": found.median_m,
@@ -164,18 +147,17 @@ def _map(judged: Judged) -> dict[str, Any]:
     p: FloatArray = cloud.p_w.astype(np.float64)
     if len(p) > _MAX_POINTS:
         p = p[np.random.default_rng(0).choice(len(p), _MAX_POINTS, replace=False)]
-    distance = surfaces(judged.sim3.alignment.points(p))
+    distance = surfaces(score.sim3.alignment.points(p))
     within = {f"map_within_{round(100 * t)}cm": np.mean(distance <= t) for t in (0.05, 0.10)}
     return {"map_median_m": np.median(distance), **within, "map_judged": 1.0}
 
 
-METRICS: tuple[Callable[[Judged], Mapping[str, Any]], ...] = (
+METRICS: tuple[Callable[[RunFolder, RunScore], Mapping[str, Any]], ...] = (
     _trajectory,
     _scale,
     _beginning,
-    lambda judged: live_figures(judged.run, judged.poses),
-    lambda judged: returns(judged.poses, judged.run.trajectory, judged.run.online),
-    _map,
+    lambda run, score: live_figures(run, score.truth),
+    lambda run, score: returns(score.truth, run.trajectory, run.online),
 )
 """Figures of a run with ground truth."""
 
@@ -218,15 +200,15 @@ COLUMNS = (
 recordings (tum_fr1_xyz, 7scenes_redkitchen); recordings with tracking losses scatter more."""
 
 
-def _standing_still(run: RunFolder, truth: Truth) -> dict[str, Any]:
+def _standing_still(run: RunFolder, place: Path) -> dict[str, Any]:
     """Errors of a run that never moved: those of the best fixed position; empty for one that did."""
     if float(np.ptp(run.trajectory.positions, axis=0).max()) > 0:
         return {}
-    poses = truth.trajectory()
+    poses = open_dataset(place).truth if place.is_dir() else read_trajectory(place)
     matched = poses.positions[match(poses.stamps_s, run.trajectory.stamps_s)[0]]
     if len(matched) == 0:
         return {}
     still = rms(matched - matched.mean(axis=0))
-    path = np.linalg.norm(np.diff(matched, axis=0), axis=1).sum()
-    percent = _percent(still, float(path))
+    path = float(travelled(matched)[-1])
+    percent = _percent(still, path)
     return {"ate_m": still, "online_m": still, "ate_percent": percent, "still_m": still, "path_m": path}

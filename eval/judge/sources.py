@@ -69,14 +69,7 @@ def perturbed(recording: Recording, draw: int, sigma_px: float) -> Recording:
 
 
 def reordered(recording: Recording, images: Sequence[ImageEntry], order: IntArray, stamps_s: FloatArray) -> Recording:
-    """Some of a recording's images in another order, by the camera alone; its ground truth is reordered likewise.
-
-    Args:
-        recording: As it was taken.
-        images: Its files in time order.
-        order: Number of every image played, ``(N,)``.
-        stamps_s: Stamps under which they are played, ``(N,)``.
-    """
+    """Those of its ``images`` with the numbers ``order`` ``(N,)``, under stamps ``(N,)``, and without other sensors."""
     played = [ImageEntry(i, stamp, images[k].path) for i, (k, stamp) in enumerate(zip(order, stamps_s, strict=True))]
     size = recording.camera.width, recording.camera.height
 

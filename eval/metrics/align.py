@@ -81,6 +81,11 @@ def rms(vectors: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
+def travelled(p: FloatArray) -> FloatArray:
+    """Way ``(N,)`` from the first of the positions ``(N, D)`` along them."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+
+
 def misfit(estimate: FloatArray, truth: FloatArray) -> float:
     """Sim(3) ATE of positions ``(N, 3)`` over what a fixed position would score; infinite when it is not defined."""
     still = rms(truth - truth.mean(axis=0)) if len(truth) else 0.0

@@ -71,7 +71,7 @@ def explain(
     if score.matched < _FEW:
         few = f"only {score.matched} poses have ground truth: an alignment fits almost anything to so few"
         return [*notes, few]
-    estimate = replace(estimate, stamps_s=estimate.stamps_s + score.association.offset_s)
+    estimate = replace(estimate, stamps_s=estimate.stamps_s + score.offset_s)
     notes += _match_notes(truth, estimate, score)
     notes += _scale_notes(score)
     if score.alignment.degenerate:
@@ -143,7 +143,7 @@ def _shape_notes(
     suspects = [_Suspect(whose, mistake, _misfit(t, e, max_dt_s)) for whose, mistake, t, e in undone]
     late = best_offset(truth, estimate)
     if abs(late.shift_s) > max_dt_s:
-        remedy = f"with --offset {score.association.offset_s + late.shift_s:.2f} the ATE is {late.ate_m:.3f} m"
+        remedy = f"with --offset {score.offset_s + late.shift_s:.2f} the ATE is {late.ate_m:.3f} m"
         suspects.append(_Suspect("", f"the stamps are late or early by {late.shift_s:.2f} s: {remedy}", late.share))
     named = _likeliest(suspects, min(_BETTER * shape, _POOR))
     if named is not None:
@@ -236,8 +236,7 @@ def _rotation_error(truth: Trajectory, estimate: Trajectory, score: TrajectorySc
 
     The angle *between* two poses does not help: the scalar product of quaternions is the same in any order.
     """
-    pairs = score.association
-    R_true, R = truth.T_w_c[pairs.truth, :3, :3], estimate.T_w_c[pairs.estimate, :3, :3]
+    R_true, R = (file.T_w_c[index, :3, :3] for file, index in zip((truth, estimate), score.pairs, strict=True))
     error = np.swapaxes(R_true, 1, 2) @ score.alignment.R @ R
     spread = angles(mean_rotation(error).T @ error)
     return float(np.degrees(np.median(angles(error)))), float(np.degrees(np.median(spread)))

@@ -12,7 +12,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import associate, match
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
-from edgeslam_torch.eval.metrics.align import umeyama
+from edgeslam_torch.eval.metrics.align import travelled, umeyama
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, FrameStatus
@@ -87,19 +87,19 @@ def return_error_percent(truth: Trajectory, estimate: Trajectory) -> float:
     Raises:
         EvaluationError: If the stamps do not match, or the estimate never moves.
     """
-    pairs = associate(truth.stamps_s, estimate.stamps_s)
-    p, q = truth.positions[pairs.truth], estimate.positions[pairs.estimate]
+    i, j = associate(truth.stamps_s, estimate.stamps_s)
+    p, q = truth.positions[i], estimate.positions[j]
     error = umeyama(q, p).points(q) - p
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+    way = travelled(p)
     found = []
-    for i in range(len(p)):
-        before = np.searchsorted(way, way[i] - MIN_WAY_M, side="right")
+    for k in range(len(p)):
+        before = np.searchsorted(way, way[k] - MIN_WAY_M, side="right")
         if before == 0:
             continue
-        apart = np.linalg.norm(p[:before] - p[i], axis=1)
+        apart = np.linalg.norm(p[:before] - p[k], axis=1)
         nearest = int(apart.argmin())
         if apart[nearest] <= SAME_PLACE_M:
-            found.append(np.linalg.norm(error[i] - error[nearest]) / (way[i] - way[nearest]))
+            found.append(np.linalg.norm(error[k] - error[nearest]) / (way[k] - way[nearest]))
     return 100.0 * float(np.median(found)) if found else float("nan")
 
 

@@ -1,14 +1,14 @@
 """Evaluation of one run against its data set."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, Association, on_one_clock
+from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, on_one_clock
 from edgeslam_torch.eval.inputs.dataset import EvalDataset, interpolate, open_dataset
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported, open_run
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
@@ -56,23 +56,22 @@ class RunScore:
     """Why there is no map score."""
     units: str
     """``metres`` or ``arbitrary``, as stated by the run; ``unknown`` for a bare trajectory."""
-    summary: dict[str, Any] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    summary: dict[str, Any]
+    notes: tuple[str, ...]
     """Findings of `explain`."""
-    sim3: TrajectoryScore | None = field(default=None, repr=False, compare=False)
-    """The full Sim(3) score, for plots; not part of `to_dict`."""
+    sim3: TrajectoryScore = field(repr=False)
+    """The full Sim(3) score."""
+    truth: Trajectory = field(repr=False)
+    """True poses."""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and strings for JSON; None for a figure that there is not."""
-        record = asdict(replace(self, sim3=None))
-        record.pop("sim3")
-        if self.sim3 is not None:
-            record["relative"] = [asdict(r) for r in self.sim3.relative]
-            record["drift"] = [asdict(d) for d in self.sim3.drift]
-            record["ate_sim3"] = asdict(self.sim3.ate_m)
-            record["rotation"] = asdict(self.sim3.rotation_deg)
-            record["truth_path_m"] = self.sim3.truth_path_m
-        return finite(record)
+        record = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("sim3", "truth")}
+        record["map"] = None if self.map is None else asdict(self.map)
+        record |= {name: [asdict(row) for row in getattr(self.sim3, name)] for name in ("relative", "drift")}
+        record |= {"ate_sim3": asdict(self.sim3.ate_m), "rotation": asdict(self.sim3.rotation_deg)}
+        found: dict[str, Any] = finite(record | {"truth_path_m": self.sim3.truth_path_m})
+        return found
 
 
 def evaluate_run(
@@ -104,16 +103,15 @@ def evaluate_run(
     truth = dataset.truth if dataset is not None else read_trajectory(dataset_dir)
     truth, trajectory = on_one_clock(truth, _stamped(run.trajectory, dataset))
     run = replace(run, trajectory=trajectory)
-    sim3 = score_trajectory(truth, run.trajectory, AlignmentKind.SIM3, max_dt_s, offset_s)
-    se3 = score_trajectory(truth, run.trajectory, AlignmentKind.SE3, max_dt_s, offset_s)
-    raw = score_trajectory(truth, run.trajectory, AlignmentKind.NONE, max_dt_s, offset_s)
+    kinds = (AlignmentKind.SIM3, AlignmentKind.SE3, AlignmentKind.NONE)
+    sim3, se3, raw = (score_trajectory(truth, trajectory, kind, max_dt_s, offset_s) for kind in kinds)
     online = float("nan")
     if run.online is not None:
         online = score_trajectory(truth, run.online, AlignmentKind.SIM3, max_dt_s, offset_s).ate_m.rmse
     depth_dataset = open_dataset(depth_truth_dir) if depth_truth_dir is not None else dataset
     map_score, map_note = _map_score(run, depth_dataset, sim3, thresholds_m) if judge_map else (None, "not requested")
     one_second = next((r for r in sim3.relative if r.delta == "1 s"), None)
-    coverage, with_pose, first = _coverage(run, dataset, truth, sim3.association)
+    coverage, with_pose, first = _coverage(run, dataset, truth, offset_s)
     judged = se3 if run.units == "metres" else sim3
     return RunScore(
         name=run.name,
@@ -139,6 +137,7 @@ def evaluate_run(
         summary=run.summary,
         notes=tuple(explain(truth, run.trajectory, judged, max_dt_s)),
         sim3=sim3,
+        truth=truth,
     )
 
 
@@ -187,7 +186,7 @@ def _map_score(
 
 
 def _coverage(
-    run: RunFolder, dataset: EvalDataset | None, truth: Trajectory, clock: Association
+    run: RunFolder, dataset: EvalDataset | None, truth: Trajectory, offset_s: float
 ) -> tuple[float, float, float]:
     """Share of frames with a trusted pose and with any pose, and the time of the first [s]."""
     frames = dataset.frame_stamps_s if dataset is not None else np.zeros(0)
@@ -197,21 +196,16 @@ def _coverage(
         frames = frames[:limit]  # with --max-frames the run has fewer
     if len(frames) == 0:
         span = float(truth.stamps_s[-1] - truth.stamps_s[0])
-        mine = run.trajectory.stamps_s + clock.offset_s
+        mine = run.trajectory.stamps_s + offset_s
         inside = mine[(mine >= truth.stamps_s[0] - 1.0) & (mine <= truth.stamps_s[-1] + 1.0)]
         share = min(1.0, float(inside[-1] - inside[0]) / span) if len(inside) > 1 and span > 0 else 0.0
         return share, share, float(inside[0] - truth.stamps_s[0]) if len(inside) else float("nan")
     count = len(frames)
     begin = max(float(frames[0]), float(run.status[0].get("stamp_s") or "nan")) if run.status else float(frames[0])
-    first = _first_trusted(run) + clock.offset_s - begin
-    return min(1.0, run.trusted_frames / count), min(1.0, len(run.trajectory) / count), first
-
-
-def _first_trusted(run: RunFolder) -> float:
-    for row, stamp in zip(run.pose_rows, run.trajectory.stamps_s, strict=False):
-        if is_supported(row):
-            return float(stamp)
-    return float(run.trajectory.stamps_s[0])
+    rows = zip(run.pose_rows, run.trajectory.stamps_s, strict=False)
+    first = next((stamp for row, stamp in rows if is_supported(row)), run.trajectory.stamps_s[0])
+    trusted = min(1.0, run.trusted_frames / count)
+    return trusted, min(1.0, len(run.trajectory) / count), float(first) + offset_s - begin
 
 
 def _scale_inside(run: RunFolder, scale: float) -> bool | None:

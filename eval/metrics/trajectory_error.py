@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, Association, associate, nearest, on_one_clock
+from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, associate, nearest, on_one_clock
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
-from edgeslam_torch.eval.metrics.align import Alignment, AlignmentKind, any_offset, rms, umeyama
+from edgeslam_torch.eval.metrics.align import Alignment, AlignmentKind, any_offset, rms, travelled, umeyama
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.rotations import angles
 from edgeslam_torch.types import FloatArray, IntArray
@@ -77,7 +77,10 @@ class TrajectoryScore:
     """Everything `score_trajectory` finds about one estimate under one alignment."""
 
     alignment: Alignment
-    association: Association
+    pairs: tuple[IntArray, IntArray]
+    """Indices ``(M,)`` of the matched poses, true and estimated."""
+    offset_s: float
+    """Added to the estimate's stamps before matching."""
     ate_m: Stats
     """Distance of aligned positions [m]."""
     rotation_deg: Stats
@@ -123,22 +126,21 @@ def score_trajectory(
     """
     truth, estimate = on_one_clock(truth, estimate)
     try:
-        pairs = associate(truth.stamps_s, estimate.stamps_s, max_dt_s, offset_s)
+        i, j = associate(truth.stamps_s, estimate.stamps_s + offset_s, max_dt_s)
     except EvaluationError as reason:
         hints = "".join(f"; {hint}" for hint in _clock_hints(truth, estimate))
         raise EvaluationError(f"{estimate.source} against {truth.source}: {reason}{hints}") from reason
-    if len(pairs) < 2:
-        raise EvaluationError(f"{estimate.source}: {len(pairs)} pose has ground truth; a trajectory needs at least 2")
-    stamps = truth.stamps_s[pairs.truth]
-    T_true, T_raw = truth.T_w_c[pairs.truth], estimate.T_w_c[pairs.estimate]
+    if len(i) < 2:
+        raise EvaluationError(f"{estimate.source}: {len(i)} pose has ground truth; a trajectory needs at least 2")
+    stamps, T_true, T_raw = truth.stamps_s[i], truth.T_w_c[i], estimate.T_w_c[j]
     centred = T_true[:, :3, 3] - T_true[:, :3, 3].mean(axis=0)
     fixed_position_m = rms(centred)
-    path_m = float(_path(T_true)[-1])
-    jitter = fixed_position_m < _JITTER_M and path_m > 0.5 * len(pairs) * fixed_position_m
+    path_m = float(travelled(T_true[:, :3, 3])[-1])
+    jitter = fixed_position_m < _JITTER_M and path_m > 0.5 * len(i) * fixed_position_m
     if fixed_position_m < _STILL_M or jitter:
         raise EvaluationError(
             f"{truth.source}: the ground truth never moves ({1000 * fixed_position_m:.2g} mm about its mean over the "
-            f"{len(pairs)} matched poses): nothing to compare with"
+            f"{len(i)} matched poses): nothing to compare with"
         )
     try:
         found = umeyama(T_raw[:, :3, 3], T_true[:, :3, 3], alignment)
@@ -154,14 +156,15 @@ def score_trajectory(
     error_deg = _angle_deg(error)
     return TrajectoryScore(
         alignment=found,
-        association=pairs,
+        pairs=(i, j),
+        offset_s=offset_s,
         ate_m=Stats.of(error_m),
         rotation_deg=Stats.of(error_deg),
         full_transform=Stats.of(np.linalg.norm(error - np.eye(4), axis=(1, 2))),
         relative=relative_errors(T_true, T, stamps, max_dt_s) if oriented else (),
         drift=drift(T_true, T) if oriented else (),
         scale=scale,
-        matched=len(pairs),
+        matched=len(i),
         truth_path_m=path_m,
         fixed_position_m=fixed_position_m,
         stamps_s=stamps,
@@ -213,7 +216,7 @@ def relative_errors(
 
 def pairs_by_path(T: FloatArray, delta_m: float) -> tuple[IntArray, IntArray]:
     """All pairs ``(i, j)`` of poses whose path length is nearest to ``delta_m``, and within 10 % of it."""
-    path = _path(T)
+    path = travelled(T[:, :3, 3])
     i = np.arange(len(path) - 1)
     j = np.maximum(nearest(path, path[i] + delta_m), i + 1)
     # Where the camera stands still several poses have the same path; the first of them, as evo takes it.
@@ -244,11 +247,6 @@ def _angle_deg(T: FloatArray) -> FloatArray:
     if len(T) == 0 or not np.isfinite(T).all():
         return np.full(len(T), np.nan)
     return np.degrees(angles(T[:, :3, :3]))
-
-
-def _path(T: FloatArray) -> FloatArray:
-    steps = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _scale(estimate: FloatArray, truth: FloatArray) -> float:
@@ -286,8 +284,9 @@ def score_common(
     clocked = []
     for name, estimate in estimates:
         truth, estimate = on_one_clock(truth, estimate)
-        associate(truth.stamps_s, estimate.stamps_s, max_dt_s, offset_s)
-        clocked.append((name, replace(estimate, stamps_s=estimate.stamps_s + offset_s)))
+        estimate = replace(estimate, stamps_s=estimate.stamps_s + offset_s)
+        associate(truth.stamps_s, estimate.stamps_s, max_dt_s)
+        clocked.append((name, estimate))
     frames = min((e.stamps_s for _, e in clocked), key=len)
     kept = np.ones(len(frames), dtype=bool)
     for _, estimate in clocked:

@@ -58,8 +58,8 @@ def write_comparison(
     sides = []
     for folder, letter in zip((first, second), _LETTERS, strict=True):
         run = open_run(folder)
-        score, truth = judge_run(run, groundtruth, judge_map)
-        positions = run.trajectory.positions @ upright(run.trajectory, score, truth).T
+        score = judge_run(run, groundtruth, judge_map)
+        positions = run.trajectory.positions @ upright(run.trajectory, score).T
         sides.append(_Side(run, score, positions, f"{letter}: {words.readable(run.name)}"))
     write_text(out, _page(sides))
     return out

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from edgeslam_torch.eval.metrics.align import travelled
 from edgeslam_torch.eval.report.line_drawings import chart, view
 from edgeslam_torch.eval.report.words import number
 from edgeslam_torch.files.plain import open_plain
@@ -69,8 +70,7 @@ def _exit_words(exits: list[np.ndarray]) -> str:
 
 
 def _words(seconds: np.ndarray, way: np.ndarray, clearance: np.ndarray) -> str:
-    length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
-    text = f"{seconds[-1]:.0f} s, {length:.1f} m by its own map, from the dot on"
+    text = f"{seconds[-1]:.0f} s, {travelled(way)[-1]:.1f} m by its own map, from the dot on"
     if np.isfinite(clearance).any():
         text += f"; never nearer to anything solid on that map than {np.nanmin(clearance):.2f} m"
     return text + "."

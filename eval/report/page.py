@@ -18,7 +18,7 @@ from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import match
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_keyframe, open_run
-from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run, finite
 from edgeslam_torch.eval.report import words
 from edgeslam_torch.eval.report.flight_section import flight_section
@@ -73,8 +73,7 @@ def write_report(
         outputs = () if _is_page(run.path / PAGE) else (PAGE,)
         check_free(run.path, outputs, remedy="give the folder of a run")
     out = Path(out) if out is not None else run.path / PAGE
-    score, truth = judge_run(run, groundtruth, judge_map)
-    write_text(out, render(run, score, truth))
+    write_text(out, render(run, judge_run(run, groundtruth, judge_map)))
     return out
 
 
@@ -87,12 +86,12 @@ def _is_page(path: Path) -> bool:
         return False
 
 
-def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | None = None) -> str:
+def render(run: RunFolder, score: RunScore | None = None) -> str:
     """The page as text."""
     edges = _subset(run.cloud("edge_map.ply"), MAX_POINTS)
     anchors = _subset(run.cloud("anchors.ply"), _MAX_ANCHORS)
-    turn = upright(run.trajectory, score, truth) if run.up == "unknown" else np.eye(3)
-    data, packed_edges, packed_anchors = _payload(run, edges, anchors, score, truth, turn)
+    turn = upright(run.trajectory, score) if run.up == "unknown" else np.eye(3)
+    data, packed_edges, packed_anchors = _payload(run, edges, anchors, score, turn)
     text = json.dumps(finite(data), allow_nan=False, separators=(",", ":"), default=_plain).replace("<", "\\u003c")
     script = "\n".join((TEMPLATE / name).read_text(encoding="utf-8") for name in _SCRIPTS)
     parts = {
@@ -109,29 +108,21 @@ def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | No
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], page)
 
 
-def judge_run(
-    run: RunFolder, groundtruth: Path | str | None, judge_map: bool
-) -> tuple[RunScore | None, Trajectory | None]:
-    """Score and true trajectory; without a given ground truth, what the source folder offers, if anything."""
-    given = groundtruth is not None
-    place = Path(groundtruth) if groundtruth is not None else run.own_truth
+def judge_run(run: RunFolder, groundtruth: Path | str | None, judge_map: bool) -> RunScore | None:
+    """Score; without a given ground truth, by what the source folder offers, if anything."""
+    place = groundtruth if groundtruth is not None else run.own_truth
     if place is None:
-        return None, None
+        return None
     try:
-        return evaluate_run(run.path, place, judge_map=judge_map), read_trajectory(place)
+        return evaluate_run(run.path, place, judge_map=judge_map)
     except EdgeSlamError:
-        if given:
+        if groundtruth is not None:
             raise
-        return None, None
+        return None
 
 
 def _payload(
-    run: RunFolder,
-    edges: PointCloud,
-    anchors: PointCloud,
-    score: RunScore | None,
-    truth: Trajectory | None,
-    turn: FloatArray,
+    run: RunFolder, edges: PointCloud, anchors: PointCloud, score: RunScore | None, turn: FloatArray
 ) -> tuple[dict[str, Any], str, str]:
     trajectory = run.trajectory.take(slice(None, None, max(1, -(-len(run.trajectory) // _MAX_POSES))))
     begin = float(run.trajectory.stamps_s[0])
@@ -165,8 +156,8 @@ def _payload(
         "fov": [0.62, 0.46],
         "scale": table.scale(words.scale_note(run.summary)),
         "stages": table.stages(),
-        "truth": _truth_in_run(truth, score, turn),
-        "error": _error(score, begin),
+        "truth": None if score is None else _truth_in_run(score, turn),
+        "error": None if score is None else _error(score, begin),
         **_view(edges.p_w @ turn.T, positions, rotations),
         "keyframes": _keyframes(run, edges, trajectory.stamps_s[table.keyframes()], begin),
         "mapScore": words.map_rows(score),
@@ -260,13 +251,13 @@ def _status_code(row: dict[str, str]) -> int:
     return STATUSES.index(status) if status in STATUSES else STATUSES.index("lost")
 
 
-def upright(trajectory: Trajectory, score: RunScore | None, truth: Trajectory | None) -> FloatArray:
+def upright(trajectory: Trajectory, score: RunScore | None) -> FloatArray:
     """Rotation ``(3, 3)`` that turns the run's world so that z is up on the page.
 
     A run without telemetry assumes a level first camera; ground truth has the correct gravity if its z is up. Else a
     world in which the cameras' up is far from z (a trajectory that starts at the identity, z forward) is turned.
     """
-    if score is not None and score.sim3 is not None and truth is not None and _camera_up(truth)[2] > 0.2:
+    if score is not None and _camera_up(score.truth)[2] > 0.2:
         return score.sim3.alignment.R
     up = _camera_up(trajectory)
     if up[2] > 0.5 or not up.any():
@@ -366,23 +357,18 @@ def _view(points: FloatArray, positions: FloatArray, rotations: FloatArray) -> d
     }
 
 
-def _truth_in_run(truth: Trajectory | None, score: RunScore | None, turn: FloatArray) -> list[list[float]] | None:
+def _truth_in_run(score: RunScore, turn: FloatArray) -> list[list[float]]:
     """True positions moved into the run's world, so that the map stays as the run made it."""
-    if truth is None or score is None or score.sim3 is None:
-        return None
     found = score.sim3
-    inside = (truth.stamps_s >= found.stamps_s[0]) & (truth.stamps_s <= found.stamps_s[-1])
-    p = truth.positions[inside]
+    p = score.truth.positions[found.pairs[0][0] : found.pairs[0][-1] + 1]
     p = (p - found.alignment.t) @ found.alignment.R / found.alignment.scale
     return _rounded(p[:: max(1, -(-len(p) // _MAX_POSES))] @ turn.T, 4)
 
 
-def _error(score: RunScore | None, begin: float) -> dict[str, Any] | None:
-    if score is None or score.sim3 is None:
-        return None
+def _error(score: RunScore, begin: float) -> dict[str, Any]:
     found = score.sim3
     return {
-        "t": _rounded(found.stamps_s - (begin + found.association.offset_s), 4),
+        "t": _rounded(found.stamps_s - (begin + found.offset_s), 4),
         "cm": _rounded(100 * found.error_m, 3),
         "deg": _rounded(found.error_deg, 3),
         "note": words.error_note(score),

@@ -48,7 +48,7 @@ def _draw_paths(
     axes: Sequence[Axes], truth: Trajectory, drawn: Sequence[tuple[str, Trajectory, TrajectoryScore]]
 ) -> None:
     """The matched part of the truth and the aligned trajectories, in x and y, and in x and z."""
-    pairs = [score.association.truth for *_, score in drawn]
+    pairs = [score.pairs[0] for *_, score in drawn]
     true = truth.positions[slice(min(p.min() for p in pairs), max(p.max() for p in pairs) + 1)]
     for axis, k in zip(axes, (1, 2), strict=True):
         axis.plot(true[:, 0], true[:, k], color="0.6", lw=3, label="ground truth")

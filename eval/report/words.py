@@ -5,9 +5,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported
+from edgeslam_torch.eval.metrics.align import travelled
 from edgeslam_torch.eval.metrics.run_score import RunScore
 
 _MOST_SAID = 5
@@ -147,7 +146,7 @@ def figures(run: RunFolder, score: RunScore | None) -> list[Value]:
         ("times lost", number(summary.get("lost_events")), 0, ""),
         ("scale, 1 sigma", 100 * sigma if scale.get("units") == "metres" else math.nan, 1, "%"),
         ("up, 1 sigma", number(record(summary.get("up")).get("sigma_deg")), 1, "\u00b0"),
-        ("length of the path", _path_length(run), 2, unit(run)),
+        ("length of the path", float(travelled(run.trajectory.positions)[-1]), 2, unit(run)),
         ("keyframes", number(counts.get("keyframes")), 0, ""),
         ("anchors", number(counts.get("anchors")), 0, ""),
         ("edge points", number(counts.get("edge_points")), 0, ""),
@@ -190,8 +189,6 @@ def scale_note(summary: dict[str, Any]) -> str:
 
 def error_note(score: RunScore) -> str:
     """What the error charts show."""
-    if score.sim3 is None:
-        return ""
     return (
         f"After Sim(3) alignment of {score.matched} poses with {score.dataset}: position RMSE "
         f"{_length(score.ate_sim3_m)}, rotation RMSE {score.rotation_deg:.2f} deg, scale factor {score.sim3.scale:.4f}."
@@ -280,10 +277,6 @@ def _flat(value: object) -> str:
     if isinstance(value, list):
         return "; ".join(_flat(item) for item in value) or "none"
     return ", ".join(f"{key} {item}" for key, item in value.items()) if isinstance(value, dict) else str(value)
-
-
-def _path_length(run: RunFolder) -> float:
-    return float(np.linalg.norm(np.diff(run.trajectory.positions, axis=0), axis=1).sum())
 
 
 def _offered(run: RunFolder) -> int:

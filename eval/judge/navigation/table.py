@@ -9,11 +9,10 @@ import numpy as np
 
 from edgeslam_torch.eval.experiment.conditions import code_state
 from edgeslam_torch.eval.experiment.figures import markdown_table
-from edgeslam_torch.eval.experiment.runner import Local, Task, is_experiment, run_tasks
+from edgeslam_torch.eval.experiment.runner import Local, Task, check_own, run_all
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.jobs.watched import Limits
-from edgeslam_torch.writers.own_folder import check_free
 
 TABLE, FLIGHTS = "navigation.md", "flights"
 """Names in the output folder."""
@@ -32,13 +31,7 @@ EXITS_HEAD = ("behaviour", "perception", "exits there", "found", "precision", "r
 
 
 def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[str], None]) -> list[Flown]:
-    """Fly all cases and write ``navigation.md``; the folder of each in ``flights`` has its record.
-
-    Args:
-        cases: Cases to fly.
-        out: Output folder; results of the same cases and code in it are reused.
-        jobs: Number of parallel flights.
-        say: Called with a line for each finished flight.
+    """Fly all cases, ``jobs`` at a time, and write ``navigation.md``; results of the same cases and code are reused.
 
     Returns:
         All flights. One that raised an error or whose process died counts as flown and not reached.
@@ -46,7 +39,7 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
     Raises:
         OutputError: If ``out`` holds what no such judge wrote.
     """
-    check_free(out, (TABLE, FLIGHTS), lambda folder: is_experiment(folder, FLIGHTS))
+    check_own(out, FLIGHTS, (), TABLE)
     commit = code_state()
     tasks = {
         case: Task(
@@ -57,14 +50,7 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
         )
         for case in cases
     }
-    flights: dict[Case, Flown] = {}
-    for case, found, ended in run_tasks(tasks, Local(jobs, Limits(_TIMEOUT_S))):
-        if found is None:
-            flights[case] = Flown(case, ended=f"{FAILED}: {ended.reason if ended else ''}")
-        else:
-            flights[case] = Flown.of_record(found["flown"])
-        if ended is not None:
-            say(_line(flights[case]))
+    flights = run_all(tasks, Local(jobs, Limits(_TIMEOUT_S)), _flown, _line, say)
     done = [flights[case] for case in cases]
     write_text(out / TABLE, markdown(done))
     return done
@@ -79,8 +65,12 @@ def run_flight(case: dict[str, Any], folder: Path) -> dict[str, Any]:
     return {"flown": (fly_over_udp if given.perception == "udp" else fly)(given).record()}
 
 
-def _line(flown: Flown) -> str:
-    case, (there, found, right) = flown.case, flown.exits
+def _flown(case: Case, found: dict[str, Any] | None, error: str) -> Flown:
+    return Flown.of_record(found["flown"]) if found is not None else Flown(case, ended=f"{FAILED}: {error}")
+
+
+def _line(case: Case, flown: Flown) -> str:
+    there, found, right = flown.exits
     dangers = f"; {', '.join(flown.dangers)}" if flown.dangers else ""
     return (
         f"{case.behaviour} {case.world} {case.seed} {case.fault} by {case.perception}: "

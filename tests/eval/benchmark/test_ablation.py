@@ -24,16 +24,19 @@ def runs(monkeypatch, tmp_path):
     """Cases without runs: every figure follows from the settings."""
     made = []
 
-    def run_tasks(tasks, runner):
+    def run_all(tasks, runner, row, line, say):
+        rows = {}
         for case, task in tasks.items():
             made.append(dict(task.case))
             words = " ".join(task.case["arguments"])
             ate = 0.010 + 0.005 * ("alignment=false" in words) + 0.02 * ("weights=none" in words) + 0.0002 * case[1]
             figures = {"ate_sim3_m": ate, "map_median_m": 0.02, "finish_ms": 500.0, "coverage": 1.0, "fps": 9.0}
-            yield case, {"key": "k", "figures": figures | {"map_points": 5.0}, "stages": {"depth": 3.0}}, None
+            found = {"figures": figures | {"map_points": 5.0}, "stages": {"depth": 3.0}}
+            rows[case] = row(case, found, "")
+        return rows
 
     monkeypatch.setattr(benchmark, "find_recordings", lambda data, min_hz: {"kitchen": (tmp_path / "kitchen", None)})
-    monkeypatch.setattr(benchmark, "run_tasks", run_tasks)
+    monkeypatch.setattr(benchmark, "run_all", run_all)
     return made
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from edgeslam_torch.eval.experiment.figures import Figure, changes, grouped, markdown_comparison, other_conditions
+from edgeslam_torch.eval.experiment.figures import Figure, grouped, markdown_comparison, other_conditions
 
 ATE = Figure("ate", "ATE", floor=0.03, one_seed=0.10)
 SHARE = Figure("share", "share", floor=0.01, relative=False, lower_is_better=False)
@@ -25,12 +25,13 @@ def runs(*ates, **figures):
     ],
 )
 def test_difference_of_medians_is_judged_by_scatter_and_floor(before, after, verdict):
-    assert changes({"a": runs(*before)}, {"a": runs(*after)}, [ATE]) == {("a", "ate"): verdict}
+    assert ATE.change(runs(*before), runs(*after)) == verdict
 
 
 def test_shares_are_better_when_they_grow_and_what_is_gone_is_worse():
-    before, after = {"a": runs(1.0, share=0.8)}, {"a": runs(None, share=0.9)}
-    assert changes(before, after, [ATE, SHARE]) == {("a", "ate"): "worse", ("a", "share"): "better"}
+    before, after = runs(1.0, share=0.8), runs(None, share=0.9)
+    assert (ATE.change(before, after), SHARE.change(before, after)) == ("worse", "better")
+    assert ATE.change(after, before) == ""
 
 
 def test_comparison_has_a_line_a_name_and_says_what_is_missing():

@@ -1,7 +1,7 @@
 """A cell from recording to figures, on a tiny rendered flight."""
 
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def recording(tmp_path_factory):
 
 
 def run(tmp_path, cell, **changes):
-    case = {"cell": cell.to_dict(), "overrides": ["depth.weights=none"], "max_frames": None}
+    case = {"cell": asdict(cell), "overrides": ["depth.weights=none"], "max_frames": None}
     return run_cell.run_cell(case | {"flights": str(tmp_path / "flights")} | changes, tmp_path)
 
 
@@ -103,7 +103,7 @@ def test_simulated_flight_is_judged_by_its_world(tmp_path, monkeypatch):
 
     monkeypatch.setattr(flights, "flight_folder", record)
     source, truth = run_cell.opened(Cell("flight/blank_corridor", 3, course="blank_corridor"), tmp_path, tmp_path)
-    assert source.length == len(truth.trajectory()) == 8
+    assert source.length == len(open_dataset(truth.poses).truth) == 8
     floor = np.array([[0.0, 0.0, -0.25]])
     assert truth.surfaces(floor) == pytest.approx([0.25], abs=0.01), "the floor is at height 0"
 
