@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,22 +19,9 @@ class Complexity:
 def measure_complexity(network: nn.Module, height: int, width: int) -> Complexity:
     """Count parameters and multiply-accumulates of one forward pass over ``(1, 3, height, width)``; biases and batch
     norm are not counted."""
-    macs = 0
-
-    def count(module: nn.Module, _: tuple[Tensor, ...], output: Tensor) -> None:
-        nonlocal macs
-        assert isinstance(module, nn.Conv2d)
-        taps = module.weight[0].numel()
-        macs += taps * output[0].numel()
-
-    hooks = [m.register_forward_hook(count) for m in network.modules() if isinstance(m, nn.Conv2d)]
     was_training = network.training
     parameter = next(network.parameters())
-    try:
-        with torch.no_grad():
-            network.eval()(torch.zeros(1, 3, height, width, device=parameter.device, dtype=parameter.dtype))
-    finally:
-        network.train(was_training)
-        for hook in hooks:
-            hook.remove()
-    return Complexity(sum(p.numel() for p in network.parameters()), macs)
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        network.eval()(torch.zeros(1, 3, height, width, device=parameter.device, dtype=parameter.dtype))
+    network.train(was_training)
+    return Complexity(sum(p.numel() for p in network.parameters()), counter.get_total_flops() // 2)

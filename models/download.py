@@ -86,7 +86,9 @@ def download(
             reasons.append(f"{url} ({reason_of(error)})")
     else:
         raise WeightsError(f"download failed: {'; '.join(reasons)}; the part received is kept; run it again to resume")
-    found, before = _hash(part), remembered(target)
+    with part.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    before = remembered(target)
     expected = (sha256 or before or found).lower()
     if found != expected:
         discard(part)
@@ -99,11 +101,3 @@ def download(
     part.replace(target)
     discard(part)
     return Fetched(found, url)
-
-
-def _hash(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(1 << 20):
-            digest.update(chunk)
-    return digest.hexdigest()

@@ -1,10 +1,13 @@
-"""The part of the pickle language that torch writes, interpreted without importing or calling anything.
+"""Pickles that torch writes, interpreted without importing or calling anything.
 
-A pickle is a program: ``GLOBAL`` and ``REDUCE`` call whatever it names. Here a name stays a `Name` and a call a `Call`:
-the result is a tree of plain values for the caller to inspect. Every instruction costs time and memory in proportion
-to its own bytes, and their number is bounded, so that no input takes longer than a second.
+A pickle is a program: it calls whatever it names. Here a name stays a `Name` and a call a `Call`: the result is a tree
+of plain values for the caller to inspect. Python's interpreter of pickles runs it, without the instructions that torch
+does not write, and with its own for all that looks up, calls, hashes or copies. So every instruction costs time and
+memory in proportion to its own bytes, and no input takes longer than a second.
 """
 
+import io
+import pickle
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,9 +16,8 @@ from typing import Any, NamedTuple
 
 from edgeslam_torch.errors import WeightsError
 
-MAX_STEPS = 300_000
-"""Maximum number of instructions; a FastDepth module has 24 000."""
-_MARK = object()
+MAX_BYTES = 1 << 21
+"""Maximum size of a pickle; a FastDepth module's has 50 kB."""
 
 
 class Name(NamedTuple):
@@ -46,24 +48,28 @@ class Instance:
     state: Any = None
 
 
-class InertPickle:
+_Interpreter: Any = pickle._Unpickler
+_OPCODES = _Interpreter.dispatch
+
+
+class InertPickle(_Interpreter):
     """Interprets consecutive pickles in a block of bytes.
 
     Args:
-        data: The block.
-        start: Where the first pickle begins.
+        data: The block, of which the first `MAX_BYTES` are read.
         allowed: Predicate for the names that a pickle may refer to.
     """
 
-    def __init__(self, data: bytes | mmap, allowed: Callable[[Name], bool], start: int = 0) -> None:
-        self._data = data
-        self._allowed = allowed
-        self.position = start
-        """Where the next pickle begins."""
+    def __init__(self, data: bytes | mmap, allowed: Callable[[Name], bool]) -> None:
+        self._block, self._allowed = io.BytesIO(data[:MAX_BYTES]), allowed
+        super().__init__(self._block, encoding="utf-8", errors="surrogatepass")
         self.externals: list[External] = []
         """External references of all pickles so far."""
-        self._stack: list[Any] = []
-        self._memo: dict[int, Any] = {}
+
+    @property
+    def position(self) -> int:
+        """Where the next pickle begins."""
+        return self._block.tell()
 
     def load(self) -> Any:
         """The value of the next pickle.
@@ -72,72 +78,32 @@ class InertPickle:
             WeightsError: If it is damaged, too long, refers to a name that is not allowed, or uses an instruction that
                 torch does not write.
         """
-        self._stack, self._memo = [], {}
+        self.memo: dict[int, Any] = {}
         try:
-            for _ in range(MAX_STEPS):
-                code = self._take(1)
-                if code == b".":
-                    return self._stack.pop()
-                instruction = _INSTRUCTIONS.get(code)
-                if instruction is None:
-                    raise WeightsError(f"no checkpoint of torch: pickle instruction 0x{code.hex()}")
-                instruction(self)
-        except (IndexError, KeyError, TypeError, ValueError, AttributeError):
-            raise WeightsError("damaged checkpoint: its pickle is malformed") from None
-        raise WeightsError(f"no checkpoint of ours: its pickle has more than {MAX_STEPS} instructions")
+            return super().load()
+        except EOFError:
+            raise WeightsError(f"truncated checkpoint, or its pickle is larger than {MAX_BYTES >> 20} MiB") from None
+        except (LookupError, TypeError, ValueError, AttributeError, struct.error, pickle.UnpicklingError):
+            raise WeightsError("damaged checkpoint: its pickle is malformed, or not of torch") from None
 
-    def _take(self, count: int) -> bytes:
-        end = self.position + count
-        if end > len(self._data):
-            raise WeightsError("truncated checkpoint: its pickle ends early")
-        taken = self._data[self.position : end]
-        self.position = end
-        return taken
+    def find_class(self, module: str, name: str) -> Name:
+        """The name itself."""
+        found = Name(module, name)
+        if not self._allowed(found):
+            raise WeightsError(
+                f"checkpoint refers to {module[:80]}.{name[:80]}: refused, it may run code; nothing was run"
+            )
+        return found
 
-    def _number(self, format: str) -> Any:
-        return struct.unpack(format, self._take(struct.calcsize(format)))[0]
-
-    def _line(self) -> str:
-        end = self._data.find(b"\n", self.position, self.position + 200)
-        if end < 0:
-            raise WeightsError("damaged checkpoint: its pickle is malformed")
-        line = self._take(end - self.position)
-        self.position += 1
-        return line.decode()
-
-    def _push(self, value: Any) -> None:
-        self._stack.append(value)
-
-    def _push_text(self, length: int) -> None:
-        self._stack.append(self._take(length).decode("utf-8", "surrogatepass"))
-
-    def _push_integer(self, length: int) -> None:
-        self._stack.append(int.from_bytes(self._take(length), "little", signed=True))
-
-    def _pop_to_mark(self) -> list[Any]:
-        start = len(self._stack) - 1
-        while self._stack[start] is not _MARK:  # an IndexError when there is none
-            start -= 1
-        items = self._stack[start + 1 :]
-        del self._stack[start:]
-        return items
-
-    def _push_tuple(self, count: int) -> None:
-        start = len(self._stack) - count
-        if start < 0:
-            raise IndexError
-        items = tuple(self._stack[start:])
-        del self._stack[start:]
-        self._stack.append(items)
-
-    def _extend(self, items: list[Any]) -> None:
-        target = self._stack[-1]
-        if not isinstance(target, list):
-            raise TypeError
-        target.extend(items)
+    def persistent_load(self, pid: Any) -> Any:
+        """A reference, or the class that old torch wraps as ``("module", class, file, source)``."""
+        if isinstance(pid, tuple) and len(pid) == 4 and pid[0] == "module" and isinstance(pid[1], Name):
+            return pid[1]
+        self.externals.append(External(pid))
+        return self.externals[-1]
 
     def _set(self, items: list[Any]) -> None:
-        target = self._stack[-1]
+        target = self.stack[-1]
         if isinstance(target, Call | Instance):  # an instance of a dict subclass
             return
         for key, value in zip(items[::2], items[1::2], strict=True):
@@ -145,109 +111,59 @@ class InertPickle:
                 raise TypeError
             target[key] = value
 
-    def _pop_pair(self) -> list[Any]:
-        value = self._stack.pop()
-        return [self._stack.pop(), value]
+    def _set_item(self) -> None:
+        value = self.stack.pop()
+        self._set([self.stack.pop(), value])
 
-    def _name(self, module: str, name: str) -> None:
-        found = Name(module, name)
-        if not self._allowed(found):
-            raise WeightsError(
-                f"checkpoint refers to {module[:80]}.{name[:80]}: refused, it may run code; nothing was run"
-            )
-        self._stack.append(found)
-
-    def _stack_name(self) -> None:
-        module, name = self._pop_pair()
-        if not (isinstance(module, str) and isinstance(name, str)):
+    def _extend(self) -> None:
+        items = self.pop_mark()
+        if not isinstance(self.stack[-1], list):
             raise TypeError
-        self._name(module, name)
+        self.stack[-1].extend(items)
 
     def _call(self) -> None:
-        name, arguments = self._pop_pair()
+        arguments, name = self.stack.pop(), self.stack.pop()
         if not (isinstance(name, Name) and isinstance(arguments, tuple)):
             raise TypeError
         empty_dict = name == Name("collections", "OrderedDict") and not arguments
-        self._stack.append({} if empty_dict else Call(name, arguments))
+        self.append({} if empty_dict else Call(name, arguments))
 
-    def _new(self, with_keywords: bool) -> None:
-        if with_keywords:
-            self._stack.pop()
-        name, _ = self._pop_pair()
+    def _new(self) -> None:
+        self.stack.pop()
+        name = self.stack.pop()
         if not isinstance(name, Name):
             raise TypeError
-        self._stack.append(Instance(name))
+        self.append(Instance(name))
+
+    def _new_with_keywords(self) -> None:
+        self.stack.pop()
+        self._new()
 
     def _build(self) -> None:
-        state = self._stack.pop()
-        if isinstance(self._stack[-1], Instance):
-            self._stack[-1].state = state
+        state = self.stack.pop()
+        if isinstance(self.stack[-1], Instance):
+            self.stack[-1].state = state
 
-    def _external(self) -> None:
-        id = self._stack.pop()
-        if isinstance(id, tuple) and len(id) == 4 and id[0] == "module" and isinstance(id[1], Name):
-            self._stack.append(id[1])  # old torch wraps a class as ("module", class, file, source)
-            return
-        self.externals.append(External(id))
-        self._stack.append(self.externals[-1])
-
-    def _put(self, index: int) -> None:
-        self._memo[index] = self._stack[-1]
-
-
-def _constant(value: Any) -> Callable[[InertPickle], None]:
-    return lambda machine: machine._push(value)
-
-
-_INSTRUCTIONS: dict[bytes, Callable[[InertPickle], object]] = {
-    b"\x80": lambda m: m._take(1),  # PROTO
-    b"\x95": lambda m: m._take(8),  # FRAME
-    b"(": _constant(_MARK),
-    b"0": lambda m: m._stack.pop(),
-    b"1": lambda m: m._pop_to_mark(),
-    b"2": lambda m: m._push(m._stack[-1]),
-    b"N": _constant(None),
-    b"\x88": _constant(True),
-    b"\x89": _constant(False),
-    b")": _constant(()),
-    b"K": lambda m: m._push(m._number("<B")),
-    b"M": lambda m: m._push(m._number("<H")),
-    b"J": lambda m: m._push(m._number("<i")),
-    b"G": lambda m: m._push(m._number(">d")),
-    b"\x8a": lambda m: m._push_integer(m._number("<B")),
-    b"\x8b": lambda m: m._push_integer(m._number("<I")),
-    b"U": lambda m: m._push_text(m._number("<B")),
-    b"T": lambda m: m._push_text(m._number("<I")),
-    b"X": lambda m: m._push_text(m._number("<I")),
-    b"\x8c": lambda m: m._push_text(m._number("<B")),
-    b"\x8d": lambda m: m._push_text(m._number("<Q")),
-    b"C": lambda m: m._push(m._take(m._number("<B"))),
-    b"B": lambda m: m._push(m._take(m._number("<I"))),
-    b"\x8e": lambda m: m._push(m._take(m._number("<Q"))),
-    b"\x85": lambda m: m._push_tuple(1),
-    b"\x86": lambda m: m._push_tuple(2),
-    b"\x87": lambda m: m._push_tuple(3),
-    b"t": lambda m: m._push(tuple(m._pop_to_mark())),
-    b"]": lambda m: m._push([]),
-    b"a": lambda m: m._extend([m._stack.pop()]),
-    b"e": lambda m: m._extend(m._pop_to_mark()),
-    b"\x8f": lambda m: m._push([]),  # a set; not needed
-    b"\x90": lambda m: m._extend(m._pop_to_mark()),
-    b"\x91": lambda m: m._push(tuple(m._pop_to_mark())),
-    b"}": lambda m: m._push({}),
-    b"s": lambda m: m._set(m._pop_pair()),
-    b"u": lambda m: m._set(m._pop_to_mark()),
-    b"q": lambda m: m._put(m._number("<B")),
-    b"r": lambda m: m._put(m._number("<I")),
-    b"\x94": lambda m: m._put(len(m._memo)),
-    b"h": lambda m: m._push(m._memo[m._number("<B")]),
-    b"j": lambda m: m._push(m._memo[m._number("<I")]),
-    b"c": lambda m: m._name(m._line(), m._line()),
-    b"\x93": lambda m: m._stack_name(),
-    b"R": lambda m: m._call(),
-    b"\x81": lambda m: m._new(with_keywords=False),
-    b"\x92": lambda m: m._new(with_keywords=True),
-    b"b": lambda m: m._build(),
-    b"Q": lambda m: m._external(),
-}
-"""Protocols 2 to 5 as torch.save writes them; it never wrote protocols 0 and 1."""
+    dispatch: dict[int, Callable[[Any], object]] = {code[0]: _OPCODES[code[0]] for code in (
+        pickle.PROTO, pickle.FRAME, pickle.STOP, pickle.MARK, pickle.POP, pickle.POP_MARK, pickle.DUP,
+        pickle.NONE, pickle.NEWTRUE, pickle.NEWFALSE, pickle.BINFLOAT,
+        pickle.BININT, pickle.BININT1, pickle.BININT2, pickle.LONG1, pickle.LONG4,
+        pickle.SHORT_BINSTRING, pickle.BINSTRING, pickle.SHORT_BINUNICODE, pickle.BINUNICODE, pickle.BINUNICODE8,
+        pickle.SHORT_BINBYTES, pickle.BINBYTES, pickle.BINBYTES8,
+        pickle.EMPTY_TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3, pickle.TUPLE, pickle.EMPTY_LIST,
+        pickle.APPEND, pickle.EMPTY_DICT, pickle.BINPUT, pickle.LONG_BINPUT, pickle.MEMOIZE,
+        pickle.BINGET, pickle.LONG_BINGET, pickle.GLOBAL, pickle.STACK_GLOBAL, pickle.BINPERSID,
+    )}  # fmt: skip
+    """Protocols 2 to 5 as torch.save writes them; it never wrote protocols 0 and 1."""
+    dispatch |= {
+        pickle.SETITEM[0]: _set_item,
+        pickle.SETITEMS[0]: lambda self: self._set(self.pop_mark()),
+        pickle.APPENDS[0]: _extend,
+        pickle.EMPTY_SET[0]: lambda self: self.append([]),  # not needed, and what is in it would be hashed
+        pickle.ADDITEMS[0]: _extend,
+        pickle.FROZENSET[0]: lambda self: self.append(tuple(self.pop_mark())),
+        pickle.REDUCE[0]: _call,
+        pickle.NEWOBJ[0]: _new,
+        pickle.NEWOBJ_EX[0]: _new_with_keywords,
+        pickle.BUILD[0]: _build,
+    }

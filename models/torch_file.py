@@ -14,7 +14,7 @@ import numpy as np
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.inert_pickle import Call, External, InertPickle, Instance, Name
-from edgeslam_torch.models.weights_file import open_weights, plain_name
+from edgeslam_torch.models.weights_file import opened, plain_name
 
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _LEGACY_PROTOCOL = 1001
@@ -31,31 +31,27 @@ _KINDS = {
     "BoolStorage": ("BOOL", 1),
 }
 """Storage class: safetensors' name of its type, and bytes per number."""
-_UPSTREAM_CLASSES = {"MobileNet", "MobileNetSkipAdd", "MobileNetSkipConcat", "NNConv", "Identity"}
-_UPSTREAM_MODULES = {"models", "imagenet.mobilenet", "__main__"}
+_NETWORKS = "MobileNet MobileNetSkipAdd MobileNetSkipConcat NNConv Identity"
 _ALLOWED = {
-    Name("collections", "OrderedDict"),
-    Name("builtins", "set"),
-    Name("__builtin__", "set"),
-    Name("torch", "Size"),
-    Name("torch._utils", "_rebuild_tensor"),
-    Name("torch._utils", "_rebuild_tensor_v2"),
-    Name("torch._utils", "_rebuild_parameter"),
+    "torch": f"Size {' '.join(_KINDS)} device",
+    "torch._utils": "_rebuild_tensor _rebuild_tensor_v2 _rebuild_parameter",
+    "models": _NETWORKS,
+    "imagenet.mobilenet": _NETWORKS,
+    "__main__": _NETWORKS,
+    "collections": "OrderedDict defaultdict",
+    "builtins": "set dict",
+    "__builtin__": "set dict",
     # Beside the model (arguments, epoch, best result, optimiser), unused:
-    Name("argparse", "Namespace"),
-    Name("pathlib", "PosixPath"),
-    Name("pathlib", "WindowsPath"),
-    Name("torch", "device"),
-    Name("torch.torch_version", "TorchVersion"),
-    Name("collections", "defaultdict"),
-    Name("builtins", "dict"),
-    Name("__builtin__", "dict"),
-    Name("numpy", "dtype"),
-    Name("numpy.core.multiarray", "scalar"),
-    Name("numpy._core.multiarray", "scalar"),
-    Name("_codecs", "encode"),
-    Name("metrics", "Result"),
+    "argparse": "Namespace",
+    "pathlib": "PosixPath WindowsPath",
+    "torch.torch_version": "TorchVersion",
+    "numpy": "dtype",
+    "numpy.core.multiarray": "scalar",
+    "numpy._core.multiarray": "scalar",
+    "_codecs": "encode",
+    "metrics": "Result",
 }
+"""Names by module, and all classes of layers and optimisers."""
 MAX_PARTS = 5000
 """Maximum modules and tensors of a network; FastDepth has 130 and 300, and a module may occur under several names."""
 MAX_DIRECTORY_BYTES = 1 << 20
@@ -106,20 +102,15 @@ def open_checkpoint(path: Path) -> Iterator[Checkpoint]:
         WeightsError: If the file is missing or damaged, or refers to anything but tensors and modules; also from inside
             the ``with``, with the file's name.
     """
-    try:
-        with open_weights(path) as file:
-            if file.seek(0, 2) == 0:
-                raise WeightsError("empty file")
-            if is_zip(file):
-                with _open_zip(file) as archive:
-                    yield _checkpoint(_ZipReader(archive))
-            else:
-                with mmap(file.fileno(), 0, access=ACCESS_READ) as data:
-                    yield _checkpoint(_LegacyReader(data))
-    except OSError as error:
-        raise WeightsError(f"{path}: cannot read ({error.strerror or error})") from error
-    except WeightsError as error:
-        raise WeightsError(f"{path}: {error}") from None
+    with opened(path) as file:
+        if file.seek(0, 2) == 0:
+            raise WeightsError("empty file")
+        if is_zip(file):
+            with _open_zip(file) as archive:
+                yield _checkpoint(_ZipReader(archive))
+        else:
+            with mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+                yield _checkpoint(_LegacyReader(data))
 
 
 def is_zip(file: BinaryIO) -> bool:
@@ -130,13 +121,8 @@ def is_zip(file: BinaryIO) -> bool:
 
 def may_refer_to(name: Name) -> bool:
     """Whether a network checkpoint may refer to a class or function."""
-    module, attribute = name
-    return (
-        name in _ALLOWED
-        or (module == "torch" and attribute in _KINDS)
-        or (module.startswith(("torch.nn.modules.", "torch.optim.")) and attribute.lstrip("_")[:1].isupper())
-        or (module in _UPSTREAM_MODULES and attribute in _UPSTREAM_CLASSES)
-    )
+    is_layer = name.module.startswith(("torch.nn.modules.", "torch.optim."))
+    return (is_layer and name.name.lstrip("_")[:1].isupper()) or name.name in _ALLOWED.get(name.module, "").split()
 
 
 class _Storage(NamedTuple):

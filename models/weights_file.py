@@ -6,7 +6,8 @@ costs at most its own size.
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -66,16 +67,11 @@ def read_weights(path: Path) -> tuple[dict[str, Array], Metadata]:
     Raises:
         WeightsError: If the file is missing, damaged, of another network, or has implausible values.
     """
-    try:
-        with open_weights(path) as file:
-            metadata, entries = _read_header(file)
-            if metadata is None:
-                metadata = metadata_without_record(entries, path)
-            return check_weights(entries, metadata), metadata
-    except OSError as error:
-        raise WeightsError(f"{path}: cannot read the weights ({error.strerror or error})") from error
-    except WeightsError as error:
-        raise WeightsError(f"{path}: {error}") from None
+    with opened(path) as file:
+        metadata, entries = _read_header(file)
+        if metadata is None:
+            metadata = metadata_without_record(entries, path)
+        return check_weights(entries, metadata), metadata
 
 
 def metadata_without_record(state: Mapping[str, HasShape], path: Path) -> Metadata:
@@ -103,16 +99,27 @@ def read_header(path: Path) -> Metadata:
     Raises:
         WeightsError: If the file is missing, no safetensors file, or has no usable metadata.
     """
+    with opened(path) as file:
+        metadata, _ = _read_header(file)
+        if metadata is None:
+            raise WeightsError("not an EdgeSLAM weights file: it holds no record")
+    return metadata
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """A weights file for reading; errors within the block say its name.
+
+    Raises:
+        WeightsError: If it cannot be read, and as the block.
+    """
     try:
         with open_weights(path) as file:
-            metadata, _ = _read_header(file)
+            yield file
     except OSError as error:
         raise WeightsError(f"{path}: cannot read the weights ({error.strerror or error})") from error
     except WeightsError as error:
         raise WeightsError(f"{path}: {error}") from None
-    if metadata is None:
-        raise WeightsError(f"{path}: not an EdgeSLAM weights file: it holds no record")
-    return metadata
 
 
 def open_weights(path: Path) -> BinaryIO:

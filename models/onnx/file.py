@@ -13,7 +13,7 @@ from onnx import TensorProto, numpy_helper
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.layout import INPUT_MULTIPLE
 from edgeslam_torch.models.record import HEADER_KEY, MAX_INPUT_PX, Metadata, metadata_from_json
-from edgeslam_torch.models.weights_file import MAX_FILE_BYTES, open_weights
+from edgeslam_torch.models.weights_file import MAX_FILE_BYTES, open_weights, opened
 
 INPUT, LOG_DEPTH, SIGMA = "image", "log_depth", "sigma_log"
 MAX_VALUE = 1e9
@@ -42,23 +42,21 @@ def parse_onnx(path: Path) -> OnnxFile:
     Raises:
         WeightsError: If it is missing or no ONNX file, needs files that are not beside it, or holds a loop.
     """
-    try:
-        with open_weights(path) as file:
+    with opened(path) as file:
+        try:
             content = file.read()
-        model = onnx.load_model_from_string(content)
-        for graph in every_graph(model):
-            loops = [node.op_type for node in graph if node.op_type in LOOPS]
-            if loops:
-                raise WeightsError(f"holds a {loops[0]}: its termination is undecidable; export the network without")
-        if _brought_in(model, path):
-            content = model.SerializeToString()
-        return OnnxFile(path, content, model)
-    except OSError as error:
-        raise WeightsError(f"{path}: cannot read the weights ({error.strerror or error})") from error
-    except (DecodeError, ValueError, TypeError, RuntimeError, onnx.checker.ValidationError) as error:
-        raise WeightsError(f"{path}: damaged or not an ONNX file ({' '.join(str(error).split())[:80]})") from None
-    except WeightsError as error:
-        raise WeightsError(f"{path}: {error}") from None
+            model = onnx.load_model_from_string(content)
+            for graph in every_graph(model):
+                loops = [node.op_type for node in graph if node.op_type in LOOPS]
+                if loops:
+                    raise WeightsError(
+                        f"holds a {loops[0]}: its termination is undecidable; export the network without"
+                    )
+            if _brought_in(model, path):
+                content = model.SerializeToString()
+        except (DecodeError, ValueError, TypeError, RuntimeError, onnx.checker.ValidationError) as error:
+            raise WeightsError(f"damaged or not an ONNX file ({' '.join(str(error).split())[:80]})") from None
+    return OnnxFile(path, content, model)
 
 
 def every_graph(model: onnx.ModelProto) -> Iterator[Sequence[onnx.NodeProto]]:
