@@ -45,32 +45,17 @@ class TrainingResult:
     nothing_to_do: bool = False
     """Whether an earlier call had completed it."""
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain values, without the place of the file."""
-        record = dataclasses.asdict(self)
-        del record["weights"], record["nothing_to_do"]
-        return record
-
-    @staticmethod
-    def from_json(record: dict[str, Any], weights: Path) -> "TrainingResult":
-        """Inverse of `to_json`.
-
-        Raises:
-            KeyError, TypeError: If the record is another one.
-        """
-        before, last, kept = (record[k] and DepthScores(**record[k]) for k in ("before", "last", "kept"))
-        return TrainingResult(weights, record["steps"], record["kept_step"], before, last, kept)
-
     def describe(self) -> str:
         """A short table, and which weights were kept."""
-        done = "nothing was left to train: " if self.nothing_to_do else ""
-        if self.before is None or self.last is None or self.kept is None:
-            return f"{done}{self.weights}: {self._words()}"
-        rows = [("before", self.before), (f"after {self.steps} steps", self.last)]
+        rows = {"before": self.before, f"after {self.steps} steps": self.last}
         if self.kept_step not in (0, self.steps):
-            rows.append((f"kept, step {self.kept_step}", self.kept))
-        table = ["| | AbsRel | AbsRel, median scaled | delta1 |", "|---|---|---|---|"]
-        table += [f"| {name} | {s.abs_rel:.4f} | {s.abs_rel_scaled:.4f} | {s.delta1:.4f} |" for name, s in rows]
+            rows[f"kept, step {self.kept_step}"] = self.kept
+        table = [
+            f"| {name} | {s.abs_rel:.4f} | {s.abs_rel_scaled:.4f} | {s.delta1:.4f} |" for name, s in rows.items() if s
+        ]
+        if table:
+            table = ["| | AbsRel | AbsRel, median scaled | delta1 |", "|---|---|---|---|", *table]
+        done = "nothing was left to train: " if self.nothing_to_do else ""
         return "\n".join([*table, f"{done}{self.weights}: {self._words()}"])
 
     def warnings(self) -> list[str]:
@@ -117,9 +102,6 @@ WITH_RESUME = (*NOT_COMPARED, "lr", "encoder_lr")
 """Settings that may differ with ``--resume``: after a divergence, training continues at a smaller rate."""
 _CONTENT = "images of "
 
-Inputs = dict[str, Any]
-"""Everything that determines the result, by name: weights, data, the content of each data set, settings."""
-
 
 class Existing(StrEnum):
     """What to do with an existing fine-tuning."""
@@ -133,23 +115,26 @@ class Existing(StrEnum):
 
 
 def inputs(
-    weights: str, data: Sequence[tuple[str, str]], validation: Sequence[str], settings: Mapping[str, Any]
-) -> Inputs:
-    """Inputs before anything is read.
+    start: tuple[nn.Module, Metadata],
+    data: Sequence[tuple[str, str]],
+    validation: Sequence[str],
+    settings: Mapping[str, Any],
+) -> dict[str, Any]:
+    """What determines the result, by name, before anything is read; with `contents`, all of it.
 
     Args:
-        weights: From `weights_name`.
+        start: Network and metadata to begin with.
         data: Name and kind of each set: ``depth`` (labelled) or ``run`` (poses and map points).
         validation: Names of the sets to validate on.
         settings: By name, plain values.
     """
     named = ", ".join(f"{name} ({kind})" for name, kind in data)
-    return {"weights": weights, "data": named, "validation": ", ".join(validation) or "none", **settings}
+    return {"weights": weights_name(*start), "data": named, "validation": ", ".join(validation) or "none", **settings}
 
 
-def contents(sets: Iterable[DepthFolder | PosedSequence]) -> Inputs:
+def contents(sets: Iterable[DepthFolder | PosedSequence]) -> dict[str, Any]:
     """What was read, to be added to the inputs."""
-    found: Inputs = {}
+    found: dict[str, Any] = {}
     for one in sets:
         found[_CONTENT + one.name] = found.get(_CONTENT + one.name, "") + content(one)
     return found
@@ -179,7 +164,7 @@ def _hash(arrays: Iterable[np.ndarray], text: str = "") -> str:
     return digest.hexdigest()
 
 
-def differences(then: Inputs, now: Inputs, ignored: Sequence[str] = NOT_COMPARED) -> list[str]:
+def _differences(then: dict[str, Any], now: dict[str, Any], ignored: Sequence[str] = ()) -> list[str]:
     """What differs, in words, but for some settings; data that was not read yet is not compared."""
     unread = {name for name in then.keys() ^ now.keys() if name.startswith(_CONTENT)}
     names = sorted((then.keys() | now.keys()) - {*ignored, *unread})
@@ -210,7 +195,7 @@ class OutFolder:
         """Whether training here writes this file."""
         return any((self.path / name).is_file() and file.samefile(self.path / name) for name in FILES)
 
-    def check(self, given: Inputs) -> None:
+    def check(self, given: dict[str, Any]) -> None:
         """Check whether training with ``given`` may begin or resume here; writes nothing.
 
         Raises:
@@ -233,14 +218,14 @@ class OutFolder:
         if step > given["steps"]:
             raise ConfigError(f"{self.path}: has {step} steps already, so it cannot end after {given['steps']}")
         resumed = self.existing is Existing.RESUME
-        if different := differences(record["given"], given, WITH_RESUME if resumed else NOT_COMPARED):
-            only_rate = not differences(record["given"], given, WITH_RESUME)
+        if different := _differences(record["given"], given, WITH_RESUME if resumed else NOT_COMPARED):
+            only_rate = not _differences(record["given"], given, WITH_RESUME)
             way_out = "--resume to continue with it" if only_rate else "--overwrite to replace it"
             raise ConfigError(
                 f"{self.path}: holds another fine-tuning ({'; '.join(different)}); give another --out, or {way_out}"
             )
 
-    def begin(self, given: Inputs) -> None:
+    def begin(self, given: dict[str, Any]) -> None:
         """Record the inputs, and remove files of other trainings.
 
         Raises:
@@ -250,20 +235,23 @@ class OutFolder:
         self.check(given)
         record = self._record() if self.existing is not Existing.OVERWRITE else None
         # One that was interrupted before the first step may have left its teacher's depth.
-        if record is None or (not self.step and differences(record["given"], given, WITH_RESUME)):
-            self._clear()
-            record = None
+        if record is None or (not self.step and _differences(record["given"], given, WITH_RESUME)):
+            for path in (self.path / name for name in FILES):
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink(missing_ok=True)
+            record = {"sessions": []}
         session = {"from_step": self.step, "processes": world(), "version": __version__}
         session |= {name: given[name] for name in WITH_RESUME if name in given}
-        sessions = [*(record["sessions"] if record is not None else ()), session]
-        self._write({"given": given, "sessions": sessions, "outcome": None})
+        self._write({"given": given, "sessions": [*record["sessions"], session], "outcome": None})
 
-    def finished(self, given: Inputs) -> TrainingResult | None:
+    def finished(self, given: dict[str, Any]) -> TrainingResult | None:
         """Result of an identical earlier training, if any."""
         record, weights = self._record(), self.path / WEIGHTS
         if record is None or record["outcome"] is None or self.existing is Existing.OVERWRITE or not weights.is_file():
             return None
-        return None if differences(record["given"], given, ()) else TrainingResult.from_json(record["outcome"], weights)
+        return None if _differences(record["given"], given) else _outcome(record["outcome"], weights)
 
     def finish(self, outcome: TrainingResult) -> None:
         """Record the outcome.
@@ -271,16 +259,8 @@ class OutFolder:
         Raises:
             OSError: If the file cannot be written.
         """
-        self._write({**(self._record() or {}), "outcome": outcome.to_json()})
-
-    def _clear(self) -> None:
-        """The record is kept until rewritten: it marks the folder as ours."""
-        for name in FILES:
-            path = self.path / name
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
+        kept = {k: v for k, v in dataclasses.asdict(outcome).items() if k not in ("weights", "nothing_to_do")}
+        self._write({**(self._record() or {}), "outcome": kept})
 
     def _write(self, record: dict[str, Any]) -> None:
         write_text(self.path / RECORD, json.dumps(record, indent=2) + "\n")
@@ -292,10 +272,16 @@ class OutFolder:
         try:
             record = json.loads(path.read_text(encoding="utf-8"))
             if record["outcome"] is not None:
-                TrainingResult.from_json(record["outcome"], self.path / WEIGHTS)
+                _outcome(record["outcome"], path)
             return {"given": dict(record["given"]), "sessions": list(record["sessions"]), "outcome": record["outcome"]}
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise OutputError(f"{path}: unreadable ({type(error).__name__}); give another --out") from error
+
+
+def _outcome(record: dict[str, Any], weights: Path) -> TrainingResult:
+    """From the plain values of `OutFolder.finish`."""
+    before, last, kept = (record[k] and DepthScores(**record[k]) for k in ("before", "last", "kept"))
+    return TrainingResult(weights, record["steps"], record["kept_step"], before, last, kept)
 
 
 @contextmanager

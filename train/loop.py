@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -83,8 +84,7 @@ def train(
         WeightsError: If ``out/last.pt`` is damaged or of another network.
         OSError: If the file cannot be written.
     """
-    least = world() * config.accumulate
-    if least > config.batch:
+    if world() * config.accumulate > config.batch:
         parts = f" that learn in {config.accumulate} parts" if config.accumulate > 1 else ""
         raise ConfigError(f"{world()} processes{parts} for a batch of {config.batch}: every one needs an image")
     out.mkdir(parents=True, exist_ok=True)
@@ -102,111 +102,216 @@ def train(
         state.best, state.history = before["score"], [{"step": 0.0, **before}]
     if state.step > config.steps:
         raise ConfigError(f"{out / LAST}: has {state.step} steps already, so it cannot end after {config.steps}")
+    run = _Run(state, signals, config, metadata, out, validate, hooks)
     with ExitStack() as closing:
         for hook in hooks:
             closing.callback(hook.close)
         try:
             for hook in hooks:
                 hook.on_start(state, config)
-            reason = _loop(state, signals, config, metadata, out, validate, hooks)
+            reason = run.all_steps()
         except DivergedError as error:
             raise type(error)(f"{error}; {_kept(out)}") from None
         except BaseException:
-            _rescue(state, out)
+            run.rescue()
             raise
-        by_first(lambda: _finish(state, metadata, out))
+        by_first(run.finish)
         for hook in hooks:
             hook.on_end(state, reason)
     return state
 
 
-def _loop(
-    state: TrainState,
-    signals: Sequence[Signal],
-    config: TrainConfig,
-    metadata: Metadata,
-    out: Path,
-    validate: Validation | None,
-    hooks: Sequence[Hooks],
-) -> str:
-    """Run all steps; returns the reason for stopping."""
-    with drawn(_Parts(signals, config, rank(), world()), state.step, config.steps, config.workers) as batches:
-        while True:
-            _agree_to_stop(state)
-            if validate is not None and _validation_is_due(state, config):
-                metrics = by_first(lambda: validate(state.averaged))
-                _note(state, metrics, metadata, out)
-                for hook in hooks:
-                    hook.on_validation(state, metrics)
-                _agree_to_stop(state)
-            if config.patience and state.stale >= config.patience:
-                return f"no improvement in {config.patience} validations"
-            if state.step >= config.steps:
-                return "all steps done"
-            if state.stop:
-                return state.stop
-            losses = _step(state, signals, config, hooks, next(batches))
-            for hook in hooks:
-                hook.on_step(state, losses)
-            if state.step % config.checkpoint_every == 0 or state.step == config.steps:
-                by_first(lambda: _save_good(state, out))
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Images that one forward pass sees, for one of the signals."""
+
+    signal: int
+    batch: dict[str, Tensor]
+    names: list[str]
+    """What each image shows, for messages."""
 
 
-def _validation_is_due(state: TrainState, config: TrainConfig) -> bool:
-    """Also after a resume between a step and its validation; at most once per step."""
-    noted = state.history[-1]["step"] if state.history else 0.0
-    last = state.step == config.steps or bool(state.stop)
-    return state.step > noted and (state.step % config.validate_every == 0 or last)
+def _drawn_parts(signals: Sequence[Signal], config: TrainConfig, this: int, of: int, step: int) -> list[_Part]:
+    """What process ``this`` of some learns from in a step; a function of the step, so that any process may draw it."""
+    mine = range(this, config.batch, of)
+    found = []
+    for k in range(config.accumulate):
+        for number, signal in enumerate(signals):
+            slots = [Slot(config.seed + 7919 * number, step, i) for i in mine[k :: config.accumulate]]
+            found.append(_Part(number, *signal.draw(slots)))
+    return found
 
 
-def _agree_to_stop(state: TrainState) -> None:
-    """Broadcast of one process's stop request: all must end after the same step."""
-    state.stop = next(iter(everyones([state.stop] if state.stop else [])), "")
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """One call of `train`."""
 
+    state: TrainState
+    signals: Sequence[Signal]
+    config: TrainConfig
+    metadata: Metadata
+    out: Path
+    validate: Validation | None
+    hooks: Sequence[Hooks]
 
-def _finish(state: TrainState, metadata: Metadata, out: Path) -> None:
-    save_state(state, out / LAST)
-    save_checkpoint(state.averaged, metadata, out / FINAL, half=True)
+    def all_steps(self) -> str:
+        """Run all steps; returns the reason for stopping."""
+        state, config = self.state, self.config
+        draw = partial(_drawn_parts, self.signals, config, rank(), world())
+        with drawn(draw, state.step, config.steps, config.workers) as batches:
+            while True:
+                self.agree_to_stop()
+                if self.validate is not None and self.validation_is_due():
+                    metrics = by_first(partial(self.validate, state.averaged))
+                    self.note(metrics)
+                    for hook in self.hooks:
+                        hook.on_validation(state, metrics)
+                    self.agree_to_stop()
+                if config.patience and state.stale >= config.patience:
+                    return f"no improvement in {config.patience} validations"
+                if state.step >= config.steps:
+                    return "all steps done"
+                if state.stop:
+                    return state.stop
+                losses = self.one_step(next(batches))
+                for hook in self.hooks:
+                    hook.on_step(state, losses)
+                if state.step % config.checkpoint_every == 0 or state.step == config.steps:
+                    by_first(self.save_good)
 
+    def validation_is_due(self) -> bool:
+        """Also after a resume between a step and its validation; at most once per step."""
+        step, history = self.state.step, self.state.history
+        last = step == self.config.steps or bool(self.state.stop)
+        return step > (history[-1]["step"] if history else 0) and (step % self.config.validate_every == 0 or last)
 
-def _save_good(state: TrainState, out: Path) -> None:
-    if _has_diverged(state):
+    def agree_to_stop(self) -> None:
+        """Broadcast of one process's stop request: all must end after the same step."""
+        self.state.stop = next(iter(everyones([self.state.stop] if self.state.stop else [])), "")
+
+    def note(self, metrics: dict[str, float]) -> None:
+        """Write the file first: after an interrupt in between, the step is validated again."""
+        state = self.state
+        if metrics["score"] < state.best:
+            if rank() == 0:
+                save_checkpoint(state.averaged, self.metadata, self.out / BEST, half=True)
+            state.best, state.best_step, state.stale = metrics["score"], state.step, 0
+        else:
+            state.stale += 1
+        state.history.append({"step": float(state.step), **metrics})
+        if rank() == 0:
+            write_text(self.out / CURVE, "".join(json.dumps(row) + "\n" for row in state.history))
+
+    def finish(self) -> None:
+        save_state(self.state, self.out / LAST)
+        save_checkpoint(self.state.averaged, self.metadata, self.out / FINAL, half=True)
+
+    def save_good(self) -> None:
+        """Save the state, unless the network or its average gives absurd depths for images of the last batch."""
         low, high = NO_ROOM_M
-        raise DivergedError(
-            f"step {state.step}: training has diverged, most of the depth is nearer than {low:g} m, farther than "
-            f"{high:g} m or no number"
-        )
-    save_state(state, out / LAST)
+        networks = (self.state.network, self.state.averaged)
+        if any(_share_between(network, self.state.shown, math.log(low), math.log(high)) < 0.5 for network in networks):
+            raise DivergedError(
+                f"step {self.state.step}: training has diverged, most of the depth is nearer than {low:g} m, farther "
+                f"than {high:g} m or no number"
+            )
+        save_state(self.state, self.out / LAST)
+
+    def rescue(self) -> None:
+        """Save the last completed step during an interrupt or failure, without masking it."""
+        state = self.state
+        if rank() != 0 or not state.whole or state.shown is None:
+            return
+        for name, buffer in state.network.named_buffers():
+            if name in state.statistics:
+                buffer.copy_(state.statistics[name])
+        try:
+            self.save_good()
+        except (DivergedError, OSError) as error:
+            logger.info("step %d is not saved: %s", state.step, error)
+
+    def one_step(self, parts: Sequence[_Part]) -> dict[str, float]:
+        """Learn from one batch; the losses by name."""
+        state, config, network = self.state, self.config, self.state.network
+        _set_modes(network, config)
+        if not config.freeze_norm:
+            state.statistics = {name: buffer.clone() for name, buffer in network.named_buffers()}
+        factor = learning_rate_factor(state.step, config)
+        for group in state.optimiser.param_groups:
+            group["lr"] = group["peak"] * factor
+        state.optimiser.zero_grad(set_to_none=True)
+        totals: dict[str, float] = {}
+        bad: list[str] = []
+        for start in range(0, len(parts), len(self.signals)):  # the parts of one image share a gradient
+            named: dict[str, Tensor] = {}
+            for part in parts[start : start + len(self.signals)]:
+                named |= self.losses_of(part, bad)
+            state.scaler.scale(torch.stack(list(named.values())).sum()).backward()
+            for name, value in named.items():
+                totals[name] = totals.get(name, 0.0) + float(value.detach())
+        learnt = [p for p in network.parameters() if p.grad is not None]
+        add_up([p.grad for p in learnt if p.grad is not None])
+        if failures := everyones(bad):
+            raise NonFiniteLossError(f"step {state.step}: {failures[0]}")
+        state.scaler.unscale_(state.optimiser)
+        norm = nn.utils.clip_grad_norm_(learnt, config.clip_norm)
+        # The scaler leaves out a step whose float16 gradients overflow, and scales less from then on.
+        if not state.scaler.is_enabled() and not torch.isfinite(norm):
+            raise NonFiniteLossError(f"step {state.step}: the gradient is not finite")
+        state.whole = False
+        state.scaler.step(state.optimiser)
+        state.scaler.update()
+        _average(state, config.ema_decay)
+        state.step += 1
+        state.statistics = {}
+        state.whole = True
+        return totals
+
+    def losses_of(self, part: _Part, bad: list[str]) -> dict[str, Tensor]:
+        """Losses of one part by name, ``()`` each: sums over its images, divided by the whole batch, so that parts and
+        processes add up to the mean. What is not finite is said in ``bad``.
+
+        Raises:
+            ConfigError: If a hook made something else of them than one value an image; names it.
+        """
+        state, signal = self.state, self.signals[part.signal]
+        batch = state.arithmetic.moved(part.batch)
+        if self.config.channels_last:
+            batch["image"] = batch["image"].contiguous(memory_format=torch.channels_last)
+        state.shown = batch["image"][:2]
+        with state.arithmetic.autocast():
+            predicted = state.network.predict(batch["image"])
+            seen = Drawn(signal.name, batch, predicted, signal.losses(predicted, batch))
+        for hook in self.hooks:
+            hook.on_losses(state, seen)
+            for name, value in seen.losses.items():
+                _check_loss(hook, name, value, len(part.names))
+        named = {}
+        for name, value in seen.losses.items():
+            if not torch.isfinite(value).all():
+                images = [d for d, v in zip(part.names, value, strict=True) if not torch.isfinite(v)]
+                bad.append(f"loss {signal.name}/{name} is not finite for {', '.join(images)}")
+            named[f"{signal.name}/{name}"] = value.float().sum() / self.config.batch
+        return named
 
 
-def _has_diverged(state: TrainState) -> bool:
-    """Whether the network or its average gives absurd depths for images of the last batch."""
-    if state.shown is None:
-        return False
-    low, high = (math.log(x) for x in NO_ROOM_M)
-    return any(_share_between(network, state.shown, low, high) < 0.5 for network in (state.network, state.averaged))
+def _check_loss(hook: Hooks, name: str, value: object, images: int) -> None:
+    if not isinstance(value, Tensor) or value.shape != (images,):
+        found = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+        who = f"hook {type(hook).__name__}"
+        raise ConfigError(f"{who}: loss {name!r} must be one value an image, ({images},), and is {found}")
 
 
-def _share_between(network: DepthModule, images: Tensor, low: float, high: float) -> float:
+def _share_between(network: DepthModule, images: Tensor | None, low: float, high: float) -> float:
+    """Share of log depth in a range; 1 without images."""
+    if images is None:
+        return 1.0
     was_training = network.training
     network.eval()
     with torch.no_grad():
         log_depth = network.predict_half(images).log_depth
     network.train(was_training)
     return float(((log_depth > low) & (log_depth < high)).float().mean())
-
-
-def _rescue(state: TrainState, out: Path) -> None:
-    """Save the last completed step during an interrupt or failure, without masking it."""
-    if rank() != 0 or not state.whole or state.shown is None:
-        return
-    for name, buffer in state.network.named_buffers():
-        if name in state.statistics:
-            buffer.copy_(state.statistics[name])
-    try:
-        _save_good(state, out)
-    except (DivergedError, OSError) as error:
-        logger.info("step %d is not saved: %s", state.step, error)
 
 
 def _kept(out: Path) -> str:
@@ -241,116 +346,6 @@ def learning_rate_factor(step: int, config: TrainConfig) -> float:
     return config.lr_end + (1 - config.lr_end) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """Images that one forward pass sees, for one of the signals."""
-
-    signal: int
-    batch: dict[str, Tensor]
-    names: list[str]
-    """What each image shows, for messages."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Parts:
-    """What this process learns from in a step; a function of the step's number, so that any process may draw it."""
-
-    signals: Sequence[Signal]
-    config: TrainConfig
-    this: int
-    of: int
-
-    def __call__(self, step: int) -> list[_Part]:
-        mine = range(self.this, self.config.batch, self.of)
-        parts = self.config.accumulate
-        found = []
-        for k in range(parts):
-            for number, signal in enumerate(self.signals):
-                slots = [Slot(self.config.seed + 7919 * number, step, i) for i in mine[k::parts]]
-                found.append(_Part(number, *signal.draw(slots)))
-        return found
-
-
-def _step(
-    state: TrainState,
-    signals: Sequence[Signal],
-    config: TrainConfig,
-    hooks: Sequence[Hooks],
-    parts: Sequence[_Part],
-) -> dict[str, float]:
-    network = state.network
-    _set_modes(network, config)
-    if not config.freeze_norm:
-        state.statistics = {name: buffer.clone() for name, buffer in network.named_buffers()}
-    factor = learning_rate_factor(state.step, config)
-    for group in state.optimiser.param_groups:
-        group["lr"] = group["peak"] * factor
-    state.optimiser.zero_grad(set_to_none=True)
-    totals: dict[str, float] = {}
-    bad: list[str] = []
-    for start in range(0, len(parts), len(signals)):  # the parts of one image share a gradient
-        named: dict[str, Tensor] = {}
-        for part in parts[start : start + len(signals)]:
-            named |= _losses(state, signals[part.signal], part, config, hooks, bad)
-        state.scaler.scale(torch.stack(list(named.values())).sum()).backward()
-        for name, value in named.items():
-            totals[name] = totals.get(name, 0.0) + float(value.detach())
-    add_up([p.grad for p in network.parameters() if p.grad is not None])
-    if failures := everyones(bad):
-        raise NonFiniteLossError(f"step {state.step}: {failures[0]}")
-    state.scaler.unscale_(state.optimiser)
-    norm = nn.utils.clip_grad_norm_([p for p in network.parameters() if p.grad is not None], config.clip_norm)
-    # The scaler leaves out a step whose float16 gradients overflow, and scales less from then on.
-    if not state.scaler.is_enabled() and not torch.isfinite(norm):
-        raise NonFiniteLossError(f"step {state.step}: the gradient is not finite")
-    state.whole = False
-    state.scaler.step(state.optimiser)
-    state.scaler.update()
-    _average(state, config.ema_decay)
-    state.step += 1
-    state.statistics = {}
-    state.whole = True
-    return totals
-
-
-def _losses(
-    state: TrainState, signal: Signal, part: _Part, config: TrainConfig, hooks: Sequence[Hooks], bad: list[str]
-) -> dict[str, Tensor]:
-    """Losses of one part by name, ``()`` each: sums over its images, divided by the whole batch, so that parts and
-    processes add up to the mean. What is not finite is said in ``bad``."""
-    batch = state.arithmetic.moved(part.batch)
-    if config.channels_last:
-        batch["image"] = batch["image"].contiguous(memory_format=torch.channels_last)
-    state.shown = batch["image"][:2]
-    with state.arithmetic.autocast():
-        predicted = state.network.predict(batch["image"])
-        losses = signal.losses(predicted, batch)
-    losses = _hooked(hooks, state, Drawn(signal.name, batch, predicted, losses), len(part.names))
-    named = {}
-    for name, value in losses.items():
-        if not torch.isfinite(value).all():
-            images = [d for d, v in zip(part.names, value, strict=True) if not torch.isfinite(v)]
-            bad.append(f"loss {signal.name}/{name} is not finite for {', '.join(images)}")
-        named[f"{signal.name}/{name}"] = value.float().sum() / config.batch
-    return named
-
-
-def _hooked(hooks: Sequence[Hooks], state: TrainState, drawn: Drawn, images: int) -> dict[str, Tensor]:
-    """The losses after every hook had its say.
-
-    Raises:
-        ConfigError: If a hook made something else of them than one value an image; names it.
-    """
-    for hook in hooks:
-        hook.on_losses(state, drawn)
-        for name, value in drawn.losses.items():
-            if not isinstance(value, Tensor) or value.shape != (images,):
-                found = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
-                who = f"hook {type(hook).__name__}"
-                raise ConfigError(f"{who}: loss {name!r} must be one value an image, ({images},), and is {found}")
-    return drawn.losses
-
-
 def _set_modes(network: DepthModule, config: TrainConfig) -> None:
     network.train()
     fixed: list[nn.Module] = [*network.encoder(), *network.heads()]
@@ -369,16 +364,3 @@ def _average(state: TrainState, decay: float) -> None:
                 kept.lerp_(new, 1 - decay)
             else:
                 kept.copy_(new)
-
-
-def _note(state: TrainState, metrics: dict[str, float], metadata: Metadata, out: Path) -> None:
-    """Write the file first: after an interrupt in between, the step is validated again."""
-    if metrics["score"] < state.best:
-        if rank() == 0:
-            save_checkpoint(state.averaged, metadata, out / BEST, half=True)
-        state.best, state.best_step, state.stale = metrics["score"], state.step, 0
-    else:
-        state.stale += 1
-    state.history.append({"step": float(state.step), **metrics})
-    if rank() == 0:
-        write_text(out / CURVE, "".join(json.dumps(row) + "\n" for row in state.history))

@@ -20,6 +20,8 @@ from edgeslam_torch.train.processes.device import Arithmetic
 MAX_BATCH = 1024
 """Images: tens of gigabytes."""
 MAX_WORKERS = 256
+COUNTED = ("step", "best", "best_step", "stale", "history")
+"""Fields of a state that a file keeps as they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,20 +65,22 @@ class TrainConfig:
     same, unless norms learn: each part has its own statistics."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "validate_every", "checkpoint_every", "accumulate"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.batch > MAX_BATCH:
-            raise ValueError(f"batch must be at most {MAX_BATCH}, got {self.batch}")
+        # Adam moves every weight by about its rate per step, and weights are about 0.05.
         for name in ("lr", "encoder_lr"):
-            # Adam moves every weight by about this per step, and weights are about 0.05.
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be above 0 and at most 1, got {getattr(self, name)}")
-        for name in ("seed", "patience", "warmup_steps", "frozen_stages", "workers"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
-        if self.workers > MAX_WORKERS:
-            raise ValueError(f"workers must be at most {MAX_WORKERS}, got {self.workers}")
+        for least, names in enumerate(
+            (
+                "seed patience warmup_steps frozen_stages workers",
+                "steps batch validate_every checkpoint_every accumulate",
+            )
+        ):
+            for name in names.split():
+                if getattr(self, name) < least:
+                    raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        for name, most in {"batch": MAX_BATCH, "workers": MAX_WORKERS}.items():
+            if getattr(self, name) > most:
+                raise ValueError(f"{name} must be at most {most}, got {getattr(self, name)}")
         if self.accumulate > self.batch:
             raise ValueError(f"accumulate must be at most the batch, {self.batch}, got {self.accumulate}")
         if self.device not in DEVICES:
@@ -115,17 +119,9 @@ def save_state(state: TrainState, path: Path) -> None:
     Raises:
         OSError: If the file cannot be written.
     """
-    content = {
-        "network": state.network.state_dict(),
-        "averaged": state.averaged.state_dict(),
-        "optimiser": state.optimiser.state_dict(),
-        "scaler": state.scaler.state_dict(),
-        "step": state.step,
-        "best": state.best,
-        "best_step": state.best_step,
-        "stale": state.stale,
-        "history": state.history,
-    }
+    parts = ("network", "averaged", "optimiser", "scaler")
+    content = {name: getattr(state, name).state_dict() for name in parts}
+    content |= {name: getattr(state, name) for name in COUNTED}
     # Serialised in memory first: torch masks disk errors.
     buffer = io.BytesIO()
     torch.save(content, buffer)
@@ -148,8 +144,8 @@ def resume(state: TrainState, path: Path) -> bool:
         state.optimiser.load_state_dict(content["optimiser"])
         if state.scaler.is_enabled() and content.get("scaler"):
             state.scaler.load_state_dict(content["scaler"])
-        state.step, state.best, state.stale = content["step"], content["best"], content["stale"]
-        state.best_step, state.history = content["best_step"], content["history"]
+        for name in COUNTED:
+            setattr(state, name, content[name])
     for group, peak in zip(state.optimiser.param_groups, peaks, strict=True):
         group["peak"] = peak
     return True

@@ -78,7 +78,7 @@ def by_first(work: Callable[[], T]) -> T:
             answer[0] = work()
         except Exception as error:
             failure, answer[1] = error, f"{error}"
-    with lost_is_said():
+    with _lost_is_said():
         dist.broadcast_object_list(answer)
     if failure is not None:
         raise failure
@@ -92,19 +92,8 @@ def share_of(items: Sequence[T]) -> Sequence[T]:
     return items[rank() :: world()]
 
 
-def wait_for_all() -> None:
-    """Barrier for all processes.
-
-    Raises:
-        ProcessError: If one is gone.
-    """
-    if _together():
-        with lost_is_said():
-            dist.barrier()
-
-
 def everyones(messages: Sequence[str]) -> list[str]:
-    """The messages of all processes.
+    """The messages of all processes, once each has come here.
 
     Raises:
         ProcessError: If one is gone.
@@ -112,7 +101,7 @@ def everyones(messages: Sequence[str]) -> list[str]:
     if not _together():
         return list(messages)
     gathered: list[list[str]] = [[] for _ in range(world())]
-    with lost_is_said():
+    with _lost_is_said():
         dist.all_gather_object(gathered, list(messages))
     return [message for part in gathered for message in part]
 
@@ -126,7 +115,7 @@ def add_up(tensors: Sequence[Tensor]) -> None:
     if not _together():
         return
     flat = torch.cat([t.flatten() for t in tensors])
-    with lost_is_said():
+    with _lost_is_said():
         dist.all_reduce(flat)
     start = 0
     for t in tensors:
@@ -139,7 +128,7 @@ def _together() -> bool:
 
 
 @contextmanager
-def lost_is_said() -> Iterator[None]:
+def _lost_is_said() -> Iterator[None]:
     """Gloo reports a dead peer as a closed connection."""
     try:
         yield
@@ -191,5 +180,5 @@ def _everywhere(x: Tensor) -> Tensor:
     """Sum over the processes; each process's loss depends on it, so its gradient is the sum of theirs."""
     from torch.distributed.nn.functional import all_reduce  # not in every build of torch
 
-    with lost_is_said():
+    with _lost_is_said():
         return all_reduce(x)

@@ -131,7 +131,7 @@ def finetune(
     data = data.usable()
     sets = [(f.name, "depth") for f in data.labelled] + [(s.name, "run") for s in data.posed]
     given = inputs(
-        weights_name(network, metadata),
+        (network, metadata),
         sets,
         [f.name for f in data.validation],
         settings_of(config, from_runs, reading, hooks),

@@ -41,26 +41,12 @@ def sweep_depth(
         K: Intrinsics ``(3, 3)`` [px].
         inverse_depths: Of the planes ``(D,)``, evenly spaced, in the motions' inverse unit.
     """
-    cost = matching_cost(reference, neighbours, motions, K, inverse_depths)
-    return 1.0 / _between_planes(aggregate(cost, reference), inverse_depths)
-
-
-def matching_cost(
-    reference: FloatArray,
-    neighbours: Sequence[FloatArray],
-    motions: Sequence[FloatArray],
-    K: FloatArray,
-    inverse_depths: FloatArray,
-) -> FloatArray:
-    """One minus the correlation of windows, ``(D, H, W)`` float32 in [0, 1], mean of the best neighbours.
-
-    Arguments as for `sweep_depth`.
-    """
+    # One minus the correlation of windows, (D, H, W) in [0, 1], mean of the best neighbours.
     height, width = reference.shape
     mean, spread = _statistics(reference)
     K_inverse, normal = np.linalg.inv(K), np.array([[0.0, 0.0, 1.0]])
     used = max(1, int(np.ceil(BEST * len(neighbours))))
-    out = np.empty((len(inverse_depths), height, width), np.float32)
+    cost = np.empty((len(inverse_depths), height, width), np.float32)
     costs = np.empty((len(neighbours), height, width), np.float32)
     for d, inverse in enumerate(inverse_depths):
         for k, (image, T) in enumerate(zip(neighbours, motions, strict=True)):
@@ -74,8 +60,8 @@ def matching_cost(
             costs[k] = np.clip(1.0 - together / (spread * seen_spread), 0.0, 1.0)
             # A window that reaches outside has a negative mean.
             costs[k][seen_mean < 0] = 1.0
-        out[d] = np.partition(costs, used - 1, axis=0)[:used].mean(0)
-    return out
+        cost[d] = np.partition(costs, used - 1, axis=0)[:used].mean(0)
+    return 1.0 / _between_planes(aggregate(cost, reference), inverse_depths)
 
 
 def aggregate(cost: FloatArray, grey: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.files.plain import subfolder
 from edgeslam_torch.terminal.progress import counted
-from edgeslam_torch.train.processes.distributed import rank, share_of, wait_for_all
+from edgeslam_torch.train.processes.distributed import everyones, rank, share_of
 from edgeslam_torch.train.teachers.plane_sweep import sweep_depth
 from edgeslam_torch.train.views.augment import View, fitted_view, scaled_K
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView, relative_motion
@@ -117,14 +117,17 @@ def teach(predict: Predict, sequence: PosedSequence, log_scale: float, folder: P
     for i in counted(share_of(with_partners), f"{sequence.name}: depth by the run's poses", "image", shown=rank() == 0):
         if not (path := folder / f"swept_{i}.npy").is_file():
             _save(path, _sweep(sequence, i))
-    wait_for_all()
+    everyones([])
     swept = {i: (np.load(folder / f"swept_{i}.npy"), sequence.views[i]) for i in with_partners}
     for i in counted(share_of(chosen), f"{sequence.name}: depth elsewhere", "image", shown=rank() == 0):
         if not (path := folder / f"dense_{i}.npy").is_file():
             measured = _confirmed(swept, i) if i in swept else np.zeros((1, 1), np.float32)
             _save(path, _completed(predict, sequence.views[i], measured, log_scale))
-    wait_for_all()
-    taught = [_taught(sequence.views[i], np.load(folder / f"dense_{i}.npy")) for i in chosen]
+    everyones([])
+    taught = []
+    for i in chosen:
+        view, signed = sequence.views[i], np.load(folder / f"dense_{i}.npy")
+        taught.append(Taught(View(view.image, np.abs(signed), view.K), signed > 0))
     share = float(np.mean([t.measured.mean() for t in taught]))
     logger.info("%s: %.0f %% of %d images measured", sequence.name, 100 * share, len(taught))
     return taught
@@ -144,10 +147,6 @@ def _sweep(sequence: PosedSequence, i: int) -> FloatArray:
     inverse = np.linspace(1.0 / (FAR * high), 1.0 / (NEAR * low), PLANES)
     motions = [relative_motion(view, other) for other in others]
     return sweep_depth(_grey(small), [_grey(_small(other)) for other in others], motions, small.K, inverse)
-
-
-def _taught(view: PosedView, signed: FloatArray) -> Taught:
-    return Taught(View(view.image, np.abs(signed), view.K), signed > 0)
 
 
 Swept = Mapping[int, tuple[FloatArray, PosedView]]

@@ -26,21 +26,29 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.files.plain import open_plain
 from edgeslam_torch.models.record import FOCAL_RANGE
-from edgeslam_torch.readers.image_size import image_size
-from edgeslam_torch.readers.images import MAX_PIXELS
+from edgeslam_torch.readers.images import decode
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import MAX_SHOWN, DepthFolder, load_depth_folder, reduced
-from edgeslam_torch.types import FloatArray
 
 logger = logging.getLogger(__name__)
 
-IMAGES = ("jpg", "jpeg", "png")
-DEPTHS = ("depth.png", "depth.npy")
+IMAGES, DEPTHS = ("jpg", "jpeg", "png"), ("depth.png", "depth.npy")
+PARTS = {"image": IMAGES, "depth": DEPTHS, "calibration (json)": ("json",)}
+"""What a sample has, and the extensions of each."""
 DEPTH_PER_M = 1000.0
 """Default for a depth.png whose json has no ``depth_per_m``."""
 TAIL = 64
 """Number of bytes at the end of each file that are compared to detect changes."""
-_UNREADABLE = (OSError, ValueError, IndexError, OverflowError, MemoryError, RecursionError, cv2.error)
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    MemoryError,
+    RecursionError,
+)
 PER_SHARD = 1000
 """Samples in a file that `write_shards` writes; about 200 MB."""
 
@@ -87,7 +95,7 @@ class ShardedViews(Sequence[View]):
         sample = self._samples[index]
         try:
             return reduced(_decoded(sample), self._width)
-        except (*_UNREADABLE, KeyError, TypeError, AttributeError) as error:
+        except (SourceError, *_UNREADABLE) as error:
             why = " ".join(str(error).split())[:120]
             raise SourceError(f"{sample.shard}: {sample.name} cannot be read ({why})") from error
 
@@ -112,14 +120,15 @@ def load_shards(path: Path, width: int = 400, max_frames: int | None = None) -> 
     samples: list[_Sample] = []
     left_out: list[str] = []
     digest = hashlib.sha256()
-    for shard in shards:
-        for sample in _samples_of(shard):
-            missing = _missing(sample)
-            if missing:
-                left_out.append(f"{shard.name}: {sample.name} has no {missing}")
-                continue
-            samples.append(sample)
-            digest.update(_fingerprint(sample))
+    for sample in (sample for shard in shards for sample in _samples_of(shard)):
+        missing = [what for what, kinds in PARTS.items() if not any(kind in sample.files for kind in kinds)]
+        if missing:
+            left_out.append(f"{sample.shard.name}: {sample.name} has no {missing[0]}")
+            continue
+        samples.append(sample)
+        # Last bytes, where a png has its checksum; reading all may take hours.
+        ends = [(kind, size, sample.read(kind, TAIL)) for kind, (_, size) in sorted(sample.files.items())]
+        digest.update(repr((sample.shard.name, sample.name, ends)).encode())
     if not samples:
         raise SourceError(f"{path}: no sample of image, depth and calibration{f' ({left_out[0]})' if left_out else ''}")
     if left_out:
@@ -173,62 +182,28 @@ def _samples_of(shard: Path) -> list[_Sample]:
     return samples
 
 
-def _fingerprint(sample: _Sample) -> bytes:
-    """Names, sizes and last bytes of its files, where a png has its checksum; reading all may take hours."""
-    ends = [(name, size, sample.read(name, TAIL)) for name, (_, size) in sorted(sample.files.items())]
-    return repr((sample.shard.name, sample.name, ends)).encode()
-
-
-def _missing(sample: _Sample) -> str:
-    for what, names in {"image": IMAGES, "depth": DEPTHS, "calibration (json)": ("json",)}.items():
-        if not any(name in sample.files for name in names):
-            return what
-    return ""
-
-
 def _decoded(sample: _Sample) -> View:
     image_kind, depth_kind = (next(k for k in kinds if k in sample.files) for kinds in (IMAGES, DEPTHS))
-    content = {kind: sample.read(kind) for kind in (image_kind, depth_kind, "json")}
-    record = json.loads(content["json"])
-    if not isinstance(record, dict):
-        raise ValueError("json: not a table")
-    _check_size(content[image_kind], image_kind)
-    image = cv2.imdecode(np.frombuffer(content[image_kind], np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise ValueError(f"{image_kind}: no image")
-    depth_m = _depth(content[depth_kind], depth_kind, float(record.get("depth_per_m", DEPTH_PER_M)))
-    if depth_m.shape != image.shape[:2]:
-        raise ValueError(f"depth {depth_m.shape[::-1]} of an image {image.shape[1::-1]}")
+    record = json.loads(sample.read("json"))
+    image = decode(sample.read(image_kind), image_kind, cv2.IMREAD_COLOR)
+    content = sample.read(depth_kind)
+    if depth_kind == "depth.npy":
+        depth = np.load(io.BytesIO(content), allow_pickle=False).astype(np.float32)
+    else:
+        stored = decode(content, depth_kind, cv2.IMREAD_UNCHANGED)
+        per_m = np.float32(record.get("depth_per_m", DEPTH_PER_M))
+        if stored.dtype != np.uint16 or per_m <= 0:
+            raise ValueError("depth.png: no 16-bit image")
+        depth = stored.astype(np.float32) / per_m
+    if depth.shape != image.shape[:2]:
+        raise ValueError(f"depth {depth.shape[::-1]} of an image {image.shape[1::-1]}")
     fx, fy, cx, cy = (float(record[name]) for name in ("fx", "fy", "cx", "cy"))
     height, width = image.shape[:2]
     allowed = FOCAL_RANGE[0] * width <= min(fx, fy) and max(fx, fy) <= FOCAL_RANGE[1] * width
     if not (allowed and -width <= cx <= 2 * width and -height <= cy <= 2 * height):
         raise ValueError("fx, fy, cx, cy are not a calibration")
+    depth_m = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0.0))
     return View(np.asarray(image, np.uint8), depth_m, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
-
-
-def _depth(content: bytes, kind: str, per_m: float) -> FloatArray:
-    """Metres ``(H, W)`` float32, 0 where unknown."""
-    if kind == "depth.npy":
-        depth = np.load(io.BytesIO(content), allow_pickle=False).astype(np.float32)
-        if depth.ndim != 2:
-            raise ValueError(f"depth.npy: {depth.ndim} dimensions")
-    else:
-        _check_size(content, kind)
-        stored = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        if stored is None or stored.dtype != np.uint16 or per_m <= 0:
-            raise ValueError("depth.png: no 16-bit image")
-        depth = stored.astype(np.float32) / np.float32(per_m)
-    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0.0))
-
-
-def _check_size(content: bytes, kind: str) -> None:
-    """Refuse a picture whose pixels would fill the memory, before they are decoded."""
-    size = image_size(content)
-    if size is None:
-        raise ValueError(f"{kind}: no image")
-    if size[0] * size[1] > MAX_PIXELS:
-        raise ValueError(f"{kind}: {size[0]}x{size[1]} px")
 
 
 def _write(views: Sequence[View], out: Path, name: str, first: int) -> Path:

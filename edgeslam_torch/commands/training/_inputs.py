@@ -182,13 +182,13 @@ def check_folder(
     Raises:
         ConfigError, OutputError: If it holds another training, or something else.
     """
-    from edgeslam_torch.train.folder import inputs, weights_name
+    from edgeslam_torch.train.folder import inputs
     from edgeslam_torch.train.processes.distributed import by_first
     from edgeslam_torch.train.recipes.finetune import FromRuns, settings_of
 
     validation = [os.path.basename(os.path.abspath(path)) for path in args.validate]
     settings = settings_of(config, from_runs or FromRuns.TEACHER, reading, hooks)
-    expected = inputs(weights_name(*start), sets, validation, settings)
+    expected = inputs(start, sets, validation, settings)
     by_first(lambda: out.check(expected))
 
 

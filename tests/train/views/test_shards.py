@@ -76,7 +76,7 @@ def test_files_of_others_in_metres_and_in_their_own_unit(tmp_path):
 @pytest.mark.parametrize(
     ("other", "why"),
     [
-        ({"jpg": b"no image"}, "jpg: no image"),
+        ({"jpg": b"no image"}, "jpg: cannot be decoded"),
         ({"depth_npy": b"no array"}, "cannot be read"),
         ({"json": b"{}"}, "cannot be read"),
         ({"json": b'{"fx": NaN, "fy": 1, "cx": 0, "cy": 0}'}, "are not a calibration"),
