@@ -42,24 +42,12 @@ def draws(rng, count, follows):
     return np.array([error for error, _ in out]), [s for _, s in out]
 
 
-@pytest.mark.parametrize(
-    "follows",
-    [(0.8, 1.0), pytest.param((0.4, 0.8), marks=pytest.mark.slow), pytest.param((-0.1, 0.4), marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("follows", [(0.8, 1.0), pytest.param((-0.1, 0.4), marks=pytest.mark.slow)])
 def test_truth_lies_inside_two_sigmas(rng, follows):
     error, scales = draws(rng, 60, follows)
     sigma = np.array([s.sigma for s in scales])
     assert np.mean(np.abs(error) <= 2 * sigma) >= 0.95
     assert np.mean(np.abs(error) <= 0.1 * sigma) < 0.5  # and sigma is not simply huge
-
-
-@pytest.mark.slow
-def test_sigma_ranks_scenes_by_their_error(rng):
-    """The largest third of sigmas has at least twice the error of the smallest."""
-    error, scales = draws(rng, 90, (0.0, 1.0))
-    order = np.argsort([s.sigma for s in scales])
-    low, high = (np.sqrt(np.mean(error[part] ** 2)) for part in (order[:30], order[-30:]))
-    assert high > 2 * low
 
 
 @pytest.mark.parametrize("level", [0.1, 1.0, 30.0])

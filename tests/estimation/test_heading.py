@@ -6,15 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from swung import T_B_C, swinging
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
-from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.noise import HEADING_DRIFT_RAD_S, HEADING_RAD, TURN_SHARE
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
-
-T_B_C = camera_on_body()
 
 
 def flown(rng, motion, keep=lambda sample: True, turn=0.0, spoil=lambda sample: sample, **changes):
@@ -36,14 +34,14 @@ def chi2(told, error):
 
 
 @pytest.mark.parametrize("turn", [0.0, 2.0])
-def test_they_are_the_cameras(rng, swinging, turn):
+def test_they_are_the_cameras(rng, turn):
     told, true, _ = flown(rng, swinging(14.0), turn=turn)
     off = Rotation.from_matrix(np.swapaxes(told.R_c_m, 1, 2) @ true[told.frame]).magnitude()
     assert np.degrees(off).max() < 0.1
     np.testing.assert_allclose(told.up_m, [0.0, 0.0, 1.0], atol=1e-12)
 
 
-def test_a_common_turn_costs_nothing_and_one_keyframe_alone_its_sigma(rng, swinging):
+def test_a_common_turn_costs_nothing_and_one_keyframe_alone_its_sigma(rng):
     told, _, stamps_s = flown(rng, swinging(14.0))
     n = len(told.frame)
     common, alone = np.full(n, math.radians(3.0)), np.zeros(n)
@@ -56,7 +54,7 @@ def test_a_common_turn_costs_nothing_and_one_keyframe_alone_its_sigma(rng, swing
     assert chi2(told, drift) < 1.1
 
 
-def test_half_a_percent_of_each_turn_costs_little(rng, swinging):
+def test_half_a_percent_of_each_turn_costs_little(rng):
     """As a focal length that is half a percent off turns a camera, and not by twice as much one way as the other."""
     motion = swinging(14.0)
     stamps_s = flown(rng, motion)[2]
@@ -75,7 +73,7 @@ def turned(motion, share):
     return T_w_c
 
 
-def test_nothing_is_told_without_attitude_or_metres_or_in_a_hole(rng, swinging):
+def test_nothing_is_told_without_attitude_or_metres_or_in_a_hole(rng):
     motion = swinging(14.0)
     assert flown(rng, motion, attitude=False)[0] is None
     assert flown(rng, motion, scale_sigma_log=np.inf)[0] is None
@@ -84,7 +82,7 @@ def test_nothing_is_told_without_attitude_or_metres_or_in_a_hole(rng, swinging):
     assert missing.any() and not np.isin(np.flatnonzero(missing), told.frame).any()
 
 
-def test_headings_after_a_jump_of_yaw_do_not_pass(rng, swinging):
+def test_headings_after_a_jump_of_yaw_do_not_pass(rng):
     """A map that turns by five degrees on the way is one that headings are to correct."""
 
     def jumps(sample):

@@ -1,16 +1,13 @@
 import math
 
 import pytest
+from swung import T_B_C, at_once, swinging
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.estimation.scale.belief import disagreement
-from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 from edgeslam_torch.types import ScaleEstimate
-
-T_B_C = camera_on_body()
-SURE = ScaleEstimate(2.0, 0.06, "telemetry+height")
 
 
 def test_disagreement_counts_sigmas_of_the_difference():
@@ -23,8 +20,7 @@ def test_disagreement_counts_sigmas_of_the_difference():
     assert disagreement([one]) == disagreement([]) == 0.0
 
 
-@pytest.mark.slow
-def test_health_of_a_flight_and_of_its_silence(rng, swinging, replay):
+def test_health_of_a_flight_and_of_its_silence(rng):
     motion = swinging(20.0)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=TelemetryFaults(video_delay_s=0.4)).samples()
     fusion = MotionFusion(FusionConfig(), T_B_C)
@@ -32,7 +28,7 @@ def test_health_of_a_flight_and_of_its_silence(rng, swinging, replay):
     assert (before.telemetry_age_s, before.filtering, before.sources) == (math.inf, False, ())
     assert math.isnan(before.battery)
     assert math.isnan(before.delay_s)
-    replay(fusion, motion, motion.in_gauge(rng), [s for s in samples if s.stamp_s < 15.0])
+    at_once(fusion, motion, motion.in_gauge(rng), [s for s in samples if s.stamp_s < 15.0])
     last = max((s for s in samples if s.stamp_s < 15.0), key=lambda s: s.stamp_s)
     health = fusion.health(20.0, "tracking", True)
     assert health.telemetry_age_s == pytest.approx(20.0 - last.stamp_s)

@@ -19,7 +19,7 @@ SCALE = 0.4
 T_IMU_CAM = np.eye(4)
 T_IMU_CAM[:3, :3] = Rotation.from_euler("xyz", [100.0, 5.0, 80.0], degrees=True).as_matrix()
 T_IMU_CAM[:3, 3] = [0.05, -0.02, 0.03]
-KINDS = [ADIS16448, pytest.param(MPU6050, marks=pytest.mark.slow)]
+KINDS = {"ADIS16448": ADIS16448, "MPU-6050": MPU6050}
 UNKNOWN = {"T_imu_cam": None, "time_offset_s": None}
 
 
@@ -61,9 +61,9 @@ def fitted(seen: Flight, model: ImuModel) -> Imu:
     return imu
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=["ADIS16448", "MPU-6050"])
-def test_scale_and_vertical_with_honest_sigmas(kind: ImuModel) -> None:
-    model = mounted(kind, T_IMU_CAM)
+@pytest.mark.parametrize("kind", ["ADIS16448", pytest.param("MPU-6050", marks=pytest.mark.slow)])
+def test_scale_and_vertical_with_honest_sigmas(kind: str) -> None:
+    model = mounted(KINDS[kind], T_IMU_CAM)
     errors, sigmas, tilts = [], [], []
     for seed in range(6):
         seen = flight("free", model, seed)
@@ -78,19 +78,6 @@ def test_scale_and_vertical_with_honest_sigmas(kind: ImuModel) -> None:
     assert np.max(np.abs(errors)) < 0.015
     assert np.sqrt(np.mean(z**2)) < 1.4
     assert np.sqrt(np.mean(np.square(tilts))) < 2.0
-
-
-@pytest.mark.slow
-def test_sigma_of_a_short_flight_is_honest() -> None:
-    """That by the noise, without what a real map's bend adds."""
-    model = mounted(ADIS16448, T_IMU_CAM)
-    z = []
-    for seed in range(16):
-        alignment = fitted(flight("free", model, seed, seconds=4.5), model).alignment
-        assert alignment is not None
-        z.append((alignment.log_scale - math.log(SCALE)) / math.sqrt(alignment.covariance[0, 0]))
-    assert np.mean(np.abs(z) < 2.0) > 0.8
-    assert np.sqrt(np.mean(np.square(z))) > 0.4
 
 
 @pytest.mark.parametrize("seconds", [2.4, 3.2])
@@ -123,10 +110,9 @@ def test_a_map_that_bends_in_its_first_seconds_bends_no_scale() -> None:
     assert np.max(np.abs(off)) < 0.015
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=["ADIS16448", "MPU-6050"])
-@pytest.mark.parametrize("motion", ["static", "line"])
-def test_without_acceleration_there_is_no_scale(motion: str, kind: ImuModel) -> None:
-    model = mounted(kind, T_IMU_CAM)
+@pytest.mark.parametrize(("motion", "kind"), [("static", "ADIS16448"), ("line", "MPU-6050")])
+def test_without_acceleration_there_is_no_scale(motion: str, kind: str) -> None:
+    model = mounted(KINDS[kind], T_IMU_CAM)
     for seed in range(2):
         found = fitted(flight(motion, model, seed), model)
         assert found.scale is None
@@ -147,41 +133,19 @@ def test_mount_and_clock_are_found(offset_s: float) -> None:
         assert math.exp(found.log_scale) == pytest.approx(SCALE, rel=0.02)
 
 
-@pytest.mark.parametrize("end", [11.0, *(pytest.param(end, marks=pytest.mark.slow) for end in (10.3, 9.0))])
-def test_clipped_readings_leave_the_scale_honest(end: float) -> None:
+def test_clipped_readings_leave_the_scale_honest() -> None:
     model = mounted(MPU6050, T_IMU_CAM)
     z = []
     for seed in range(4):
         seen = flight("free", model, seed)
         there = seen.readings
-        seen.readings = ImuReadings(
-            there.stamps_s, there.angular_rate_rad_s, np.clip(there.acceleration_m_s2, -end, end)
-        )
+        felt = np.clip(there.acceleration_m_s2, -11.0, 11.0)
+        seen.readings = ImuReadings(there.stamps_s, there.angular_rate_rad_s, felt)
         scale = fitted(seen, model).scale
         if scale is not None:
             z.append((scale.log_scale - math.log(SCALE)) / scale.sigma)
-    assert np.max(np.abs(z), initial=0.0) < 3.0
-    assert len(z) >= 3 or end < 10.5
-
-
-def test_a_gap_of_the_readings_costs_accuracy_only() -> None:
-    model = mounted(ADIS16448, T_IMU_CAM)
-    seen = flight("free", model, 0)
-    kept = np.abs(seen.readings.stamps_s - 6.0) > 0.4
-    there = seen.readings
-    seen.readings = ImuReadings(there.stamps_s[kept], there.angular_rate_rad_s[kept], there.acceleration_m_s2[kept])
-    found = fitted(seen, model).scale
-    assert found is not None
-    assert found.log_scale == pytest.approx(math.log(SCALE), abs=0.01)
-
-
-def test_rotation_between_frames() -> None:
-    model = mounted(ADIS16448, T_IMU_CAM)
-    seen = flight("free", model, 0)
-    R_c_c = fitted(seen, model).turned(seen.stamps_s[-3], seen.stamps_s[-1])
-    assert R_c_c is not None
-    visual = seen.T_m_c[-1, :3, :3].T @ seen.T_m_c[-3, :3, :3]
-    assert Rotation.from_matrix(R_c_c.T @ visual).magnitude() < 0.005
+    assert len(z) >= 3
+    assert np.max(np.abs(z)) < 3.0
 
 
 def test_the_pose_between_frames_turns_with_the_gyroscope() -> None:
@@ -199,25 +163,6 @@ def test_the_pose_between_frames_turns_with_the_gyroscope() -> None:
     off = [Rotation.from_matrix(p.T_w_c[:3, :3].T @ seen.T_m_c[-1, :3, :3]).magnitude() for p in (felt, guessed)]
     assert (felt.source, guessed.source) == ("visual+imu", "visual")
     assert off[0] < min(0.005, 0.2 * off[1])
-
-
-def test_a_larger_reading_shows_that_the_range_did_not_end_there() -> None:
-    model = mounted(MPU6050, T_IMU_CAM)
-    seen = flight("free", model, 1)
-    t, rate = seen.readings.stamps_s, seen.readings.angular_rate_rad_s.copy()
-    half = t < t[len(t) // 2]
-    end = 0.5 * np.abs(rate[~half, 0]).max()
-    rate[half, 0] = rate[half, 0].clip(-end, end)  # as a slow sensor that repeats its largest reading
-    readings = ImuReadings(t, rate, seen.readings.acceleration_m_s2)
-    middle_s = t[len(t) // 2]
-    imu = Imu(model)
-    imu.add([readings.between(-math.inf, middle_s)])
-    early = seen.stamps_s < middle_s
-    imu.fit(seen.stamps_s[early], seen.T_m_c[early])
-    imu.add([readings.between(middle_s, math.inf)])
-    imu.fit(seen.stamps_s, seen.T_m_c)
-    fastest_s = t[~half][np.abs(rate[~half, 0]).argmax()]
-    assert imu.turned(fastest_s - 0.05, fastest_s + 0.05) is not None
 
 
 FAULTS = {

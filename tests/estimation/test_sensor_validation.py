@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from swung import T_B_C, at_once, swinging
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.motion import MotionFusion
@@ -21,13 +22,10 @@ from edgeslam_torch.estimation.telemetry.sensor_validation import (
     agreement,
     changes,
 )
-from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 
-T_B_C = camera_on_body()
 DEPTH_LOG = 0.1
 """Error of the depth network in these tests."""
-SLOW = pytest.mark.slow
 
 # --- the comparison itself -----------------------------------------------------------------------------------------
 
@@ -164,17 +162,17 @@ def right(rng, samples, motion):
 
 
 @pytest.fixture
-def told_of(rng, at_once):
+def told_of(rng):
     """Function that gives the scale without telemetry, the fusion of a flight with spoilt telemetry, and its gauge."""
 
-    def told(motion, spoil, feed=at_once, **options):
+    def told(motion, spoil, feed=at_once):
         gauge = motion.in_gauge(rng)
         samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=TelemetryFaults()).samples()
         without, fusion = (MotionFusion(FusionConfig(), T_B_C) for _ in range(2))
         for either in (without, fusion):
             for _ in range(20):
                 either.metres.add_depth_ratio(DepthRatio(math.log(gauge.scale) + DEPTH_LOG, 0.05))
-        feed(fusion, motion, gauge, spoil(rng, samples, motion), **options)
+        feed(fusion, motion, gauge, spoil(rng, samples, motion))
         return without.scale(), fusion, gauge
 
     return told
@@ -191,7 +189,7 @@ def told_of(rng, at_once):
         pytest.param(another_flight, id="another flight"),
     ],
 )
-def test_velocities_of_no_such_flight_are_not_believed(told_of, swinging, spoil):
+def test_velocities_of_no_such_flight_are_not_believed(told_of, spoil):
     without, fusion, _ = told_of(swinging(18.0), spoil)
     scale = fusion.scale()
     assert "telemetry" not in scale.source
@@ -202,7 +200,7 @@ def test_velocities_of_no_such_flight_are_not_believed(told_of, swinging, spoil)
 
 
 @pytest.mark.parametrize("whole", [np.rint, np.trunc])
-def test_right_telemetry_is_used_without_a_word(told_of, swinging, whole):
+def test_right_telemetry_is_used_without_a_word(told_of, whole):
     def spoil(rng, samples, motion):
         return [replace(s, velocity_m_s=whole(10 * s.velocity_m_s) / 10) for s in samples]
 
@@ -226,7 +224,7 @@ def test_right_telemetry_is_used_without_a_word(told_of, swinging, whole):
         pytest.param(2, lambda x: math.nan * x, id="none"),
     ],
 )
-def test_attitude_with_one_wrong_column_is_named_and_nothing_rests_on_it(told_of, swinging, axis, change):
+def test_attitude_with_one_wrong_column_is_named_and_nothing_rests_on_it(told_of, axis, change):
     without, fusion, _ = told_of(swinging(18.0), column("rpy_rad", axis, change))
     assert fusion.scale() == without
     assert fusion.orientation.upright() is None
@@ -236,24 +234,7 @@ def test_attitude_with_one_wrong_column_is_named_and_nothing_rests_on_it(told_of
         assert not fusion.telemetry().attitude
 
 
-@pytest.mark.parametrize(
-    ("axis", "change"),
-    [
-        pytest.param(0, np.zeros_like, id="stuck"),
-        pytest.param(1, np.negative, id="mirrored"),
-        pytest.param(2, half_way(lambda x: x + 1.0), id="jumping"),
-    ],
-)
-def test_velocities_with_one_wrong_column_tell_no_scale(told_of, swinging, axis, change):
-    def spoil(rng, samples, motion):
-        return column("velocity_m_s", axis, change)(rng, no_heights(samples), motion)
-
-    _, fusion, _ = told_of(swinging(18.0), spoil)
-    assert "telemetry" not in fusion.scale().source
-    assert any("velocities are not used" in w for w in fusion.warnings())
-
-
-def sideways_late(swinging, from_s, end_s):
+def sideways_late(from_s, end_s):
     """Swung along two axes, along the third only from some time on."""
     motion = swinging(end_s)
     T, later = motion.T_w_c.copy(), np.maximum(motion.stamps_s - from_s, 0.0)
@@ -261,9 +242,9 @@ def sideways_late(swinging, from_s, end_s):
     return replace(motion, T_w_c=T)
 
 
-def test_motion_along_one_axis_proves_nothing_of_another(told_of, swinging):
+def test_motion_along_one_axis_proves_nothing_of_another(told_of):
     """Velocities that agree so far do not pull the map along an axis that has not moved yet."""
-    motion = sideways_late(swinging, 8.0, 9.0)
+    motion = sideways_late(8.0, 9.0)
     seen = replace(motion, stamps_s=motion.stamps_s[:166], T_w_c=motion.T_w_c[:166])
 
     def feed(fusion, motion, gauge, samples):
@@ -280,17 +261,15 @@ def test_motion_along_one_axis_proves_nothing_of_another(told_of, swinging):
     assert chi2 < 4.0 * reported.rows
 
 
-def test_a_column_is_proven_by_motion_along_its_axis(told_of, swinging):
+def test_a_column_is_proven_by_motion_along_its_axis(told_of):
     (_, quiet, _), moved = (
-        told_of(sideways_late(swinging, 8.0, end_s), right)[1].telemetry().gain_sigma for end_s in (8.0, 12.0)
+        told_of(sideways_late(8.0, end_s), right)[1].telemetry().gain_sigma for end_s in (8.0, 12.0)
     )
     assert quiet > 1.0 > 0.1 > max(moved)
 
 
-@pytest.mark.parametrize(
-    ("late_s", "found"), [(0.72, True), pytest.param(0.83, False, marks=SLOW), (1.2, False), (-2.0, False)]
-)
-def test_a_clock_out_of_range_is_reported_with_its_correction(told_of, swinging, late_s, found):
+@pytest.mark.parametrize(("late_s", "found"), [(0.72, True), (1.2, False), (-2.0, False)])
+def test_a_clock_out_of_range_is_reported_with_its_correction(told_of, late_s, found):
     """The video is 0.5 s late: stamps 1.2 s late give a delay of -0.7 s, where -0.2 is the least that is allowed. The
     search has a margin of a step beyond."""
     without, fusion, gauge = told_of(swinging(18.0), late_by(late_s))
@@ -340,7 +319,7 @@ def in_axes_of(rotation):
     ],
     ids=["body", "turned back", "leaning body", "right, turning", "right, leaning"],
 )
-def test_images_have_the_last_word_on_the_velocities_frame(told_of, swinging, change, rotation, frame):
+def test_images_have_the_last_word_on_the_velocities_frame(told_of, change, rotation, frame):
     """Also of a camera in a hand, which looks down and hardly turns: its velocities fit by more than 80 % as they are.
     What the filter gets is turned as well: it carries the pose on."""
     motion = change(swinging(20.0))
@@ -353,7 +332,7 @@ def test_images_have_the_last_word_on_the_velocities_frame(told_of, swinging, ch
 @pytest.mark.parametrize(
     ("factor", "heights", "source"), [(10.0, True, "height+depth"), (10.0, False, "none"), (0.5, True, None)]
 )
-def test_velocities_in_the_wrong_unit_are_named_and_the_scale_covers_them(told_of, swinging, factor, heights, source):
+def test_velocities_in_the_wrong_unit_are_named_and_the_scale_covers_them(told_of, factor, heights, source):
     """The depth network confirms the heights. Beside the network alone one of both is wrong, and nothing says which."""
 
     def spoil(rng, samples, motion):
@@ -370,44 +349,16 @@ def test_velocities_in_the_wrong_unit_are_named_and_the_scale_covers_them(told_o
         assert (model.velocity, model.height) == (False, "tof"), "nor do they pull at the map in its refinement"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["random", "stuck", "mirrored"])
-def test_heights_that_do_not_climb_with_the_images_are_not_used(told_of, swinging, replay, kind):
+@pytest.mark.parametrize("change", [lambda z: 1.0 + 0.0 * z, lambda z: 3.0 - z], ids=["stuck", "mirrored"])
+def test_heights_that_do_not_climb_with_the_images_are_not_used(told_of, change):
     def spoil(rng, samples, motion):
-        true = np.array([s.tof_m for s in samples])
-        z = {"random": rng.uniform(0.3, 2.0, len(samples)), "stuck": np.ones(len(samples)), "mirrored": 3.0 - true}[
-            kind
-        ]
-        return [replace(s, tof_m=x, height_m=x, baro_m=x) for s, x in zip(samples, z.tolist(), strict=True)]
+        z = [change(s.tof_m) for s in samples]
+        return [replace(s, tof_m=x, height_m=x, baro_m=x) for s, x in zip(samples, z, strict=True)]
 
-    _, fusion, gauge = told_of(swinging(18.0, 10.0, size_m=0.5), spoil, replay)
+    _, fusion, gauge = told_of(swinging(18.0, size_m=0.5), spoil)
     assert "height" not in fusion.scale().source
     assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.06)  # the velocities are right
     assert any("height (tof) is not used" in w for w in fusion.warnings())
-
-
-def test_telemetry_that_froze_is_named(told_of, swinging):
-    def spoil(rng, samples, motion):
-        last = next(s for s in samples if s.stamp_s > 9.0 and np.abs(s.velocity_m_s).max() > 0.15)
-        return [s if s.stamp_s < 9.0 else replace(last, stamp_s=s.stamp_s) for s in samples]
-
-    _, fusion, gauge = told_of(swinging(18.0), spoil)
-    assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.06)
-    (warning,) = fusion.warnings()
-    assert float(re.search(r"for (\d+\.\d) s", warning)[1]) == pytest.approx(8.5, abs=0.5)
-
-
-@SLOW
-def test_lies_that_begin_in_flight_take_the_scale_back(told_of, swinging, replay):
-    """Right for a while, then of another flight for three times as long: what was believed is dropped."""
-
-    def spoil(rng, samples, motion):
-        lies = with_velocities(no_heights(samples), smooth(rng, len(samples), 0.4))
-        return [s if s.stamp_s < 8.0 else t for s, t in zip(no_heights(samples), lies, strict=True)]
-
-    without, fusion, _ = told_of(swinging(32.0), spoil, replay)
-    assert "telemetry" not in fusion.scale().source
-    assert fusion.scale().sigma == pytest.approx(without.sigma, rel=1e-3)
 
 
 # --- what constrains the map --------------------------------------------------------------------------------------

@@ -64,13 +64,3 @@ def test_undistorted_image_shows_a_point_where_undistorted_points_say():
     cv2.circle(image, (100, 90), 6, 255, -1, cv2.LINE_AA)
     v, u = np.nonzero(camera.undistort_image(image) > 127)
     np.testing.assert_allclose([u.mean(), v.mean()], camera.undistort_points(at)[0], atol=0.35)
-
-
-def test_camera_without_distortion_changes_nothing(rng):
-    uv = rng.uniform(0, 480, (5, 2)).astype(np.float32)
-    image = rng.integers(0, 255, (480, 640), dtype=np.uint8)
-    np.testing.assert_array_equal(CAMERA.undistort_points(uv), uv)
-    assert CAMERA.undistort_image(image) is image
-    assert CAMERA.undistort_points(np.zeros((0, 2))).shape == (0, 2)
-    np.testing.assert_array_equal(CAMERA.distort_points(uv), uv)
-    assert CAMERA.distort_points(np.zeros((0, 2))).shape == (0, 2)

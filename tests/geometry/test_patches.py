@@ -96,22 +96,7 @@ def test_a_distant_view_is_found_with_its_warp():
     assert straight.sigma_px[0] > 5 * warped.sigma_px[0], "and what does not fit is not sure"
 
 
-def test_every_point_may_come_from_a_camera_of_its_own(rng):
-    poses = np.stack([se3.exp(xi) for xi in rng.normal(0.0, 0.2, (len(PLACES), 6))])
-    depth = rng.uniform(2.0, 4.0, len(PLACES))
-    at_once = patch_warps(PLACES, depth, poses, CAMERA)
-    for i in range(len(PLACES)):
-        alone = patch_warps(PLACES[i : i + 1], depth[i : i + 1], poses[i], CAMERA)
-        np.testing.assert_allclose(at_once[i : i + 1], alone, rtol=1e-12)
-
-
 def test_a_straight_edge_is_unobservable_along_itself():
     v, u = np.mgrid[:240, :320].astype(float)
     edge = np.clip(128 + 60 * np.tanh(u - 60.0), 0, 255).astype(np.uint8)
     assert not (find(edge, PLACES, templates(edge, PLACES, SAME)).sigma_px < 0.5).any()
-
-
-def test_no_patches_give_no_results():
-    none = np.zeros((0, 2))
-    found = find(image(), none, templates(image(), none, np.zeros((0, 2, 2))))
-    assert found.uv.shape == (0, 2) and found.sigma_px.shape == (0,)

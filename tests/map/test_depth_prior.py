@@ -28,15 +28,12 @@ def points(rng):
     return filled(rng, 300, 3)
 
 
-def test_network_depth_is_scaled_to_map_units(points):
-    keyframe, z = points.keyframes[0], points.depths(0)
+def at_keypoints(keyframe, z, sigma_log, **kind):
+    """A depth map that knows the keypoints of a keyframe."""
     depth = np.full((480, 640), np.nan, np.float32)
     u, v = np.rint(keyframe.features.uv).astype(int).T
-    depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = z / 3.0  # the network's metre is three map units
-    keyframe.depth = DepthMap(depth, np.full((480, 640), 0.12, np.float32))
-    prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors)
-    np.testing.assert_allclose(np.median(prior / z), 1.0, rtol=1e-5)
-    np.testing.assert_allclose(sigma, np.hypot(0.12, 0.05), rtol=1e-6)
+    depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = z
+    return DepthMap(depth, np.full((480, 640), sigma_log, np.float32), **kind)
 
 
 def test_neighbouring_anchors_replace_a_missing_network(points):
@@ -49,15 +46,12 @@ def test_neighbouring_anchors_replace_a_missing_network(points):
     assert np.mean(np.abs(np.log(prior / z)) < 0.35) > 0.68
 
 
-@pytest.mark.parametrize(("twist", "sigma_log"), [(0.0, 0.051), (0.3, 0.061)])
-def test_a_wrong_network_is_corrected_by_anchors_with_a_larger_sigma(points, twist, sigma_log):
-    """An error that grows across the image, as in an unfamiliar room, with a stated sigma of 1 %."""
+@pytest.mark.parametrize(("twist", "stated", "sigma_log"), [(0.0, 0.01, 0.051), (0.0, 0.12, 0.13), (0.3, 0.01, 0.061)])
+def test_a_wrong_network_is_corrected_by_anchors_with_a_larger_sigma(points, twist, stated, sigma_log):
+    """Its metre is three map units, and an error grows across the image, as in an unfamiliar room."""
     keyframe, z = points.keyframes[0], points.depths(0)
-    u, v = np.rint(keyframe.features.uv).astype(int).T
-    error = twist * (u - 320) / 320
-    depth, sigma = np.full((480, 640), np.nan, np.float32), np.full((480, 640), 0.01, np.float32)
-    depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = z * np.exp(error)
-    keyframe.depth = DepthMap(depth, sigma)
+    error = twist * (np.rint(keyframe.features.uv[:, 0]) - 320) / 320
+    keyframe.depth = at_keypoints(keyframe, z / 3.0 * np.exp(error), stated)
     prior, prior_sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors)
     known = np.isfinite(prior)
     left = np.abs(np.log(prior / z))[known]
@@ -66,23 +60,16 @@ def test_a_wrong_network_is_corrected_by_anchors_with_a_larger_sigma(points, twi
     assert np.mean(left < 2.5 * prior_sigma[known]) > 0.9
 
 
-def relative_map(points, view, scale=0.7, shift=0.02):
-    """Relative depth at the keypoints of a view: its inverse is right up to scale and shift."""
-    keyframe = points.keyframes[view]
-    depth = np.full((480, 640), np.nan, np.float32)
-    u, v = np.rint(keyframe.features.uv).astype(int).T
-    depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = scale / (1.0 / points.depths(view) - shift)
-    return DepthMap(depth, np.full((480, 640), 0.25, np.float32), is_relative=True)
-
-
-def test_relative_depth_is_fitted_by_scale_and_shift(points):
+def test_relative_depth_is_fitted_by_scale_and_shift_to_triangulated_anchors(points):
     keyframe, z = points.keyframes[0], points.depths(0)
-    keyframe.depth = relative_map(points, 0)
+    keyframe.depth = at_keypoints(keyframe, 0.7 / (1.0 / z - 0.02), 0.25, is_relative=True)
     prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors)
     known = np.isfinite(prior)
     assert known.mean() > 0.9
     np.testing.assert_allclose(prior[known], z[known], rtol=0.02)
     assert np.median(sigma) < 0.1
+    points.map.anchors.from_depth[:] = True
+    np.testing.assert_allclose(depth_prior(keyframe, keyframe.features.uv, points.map.anchors)[1], 0.35)
 
 
 def test_sampling_takes_the_nearest_pixel_and_preserves_holes():
@@ -104,23 +91,13 @@ def test_fit_finds_the_ratio_despite_a_third_of_outliers(rng):
     assert fit.sigma_log == 0.02  # its floor: most agree exactly
 
 
-def test_keyframe_without_anchors_has_a_wide_prior(points):
+@pytest.mark.parametrize("behind", [False, True])
+def test_keyframe_without_anchors_before_it_has_a_wide_prior(points, behind):
     keyframe = points.keyframes[0]
-    keyframe.anchor[:] = -1
+    if behind:
+        keyframe.T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ keyframe.T_c_w
+    else:
+        keyframe.anchor[:] = -1
     prior, sigma = depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors)
     assert np.isnan(prior).all()
     assert np.isinf(sigma).all()
-
-
-def test_anchors_behind_the_camera_do_not_count(points):
-    keyframe = points.keyframes[0]
-    keyframe.T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ keyframe.T_c_w
-    assert np.isnan(depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors)[0]).all()
-
-
-def test_anchors_from_relative_depth_do_not_fit_its_scale(points):
-    keyframe = points.keyframes[0]
-    keyframe.depth = relative_map(points, 0)
-    points.map.anchors.from_depth[:] = True
-    _, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors)
-    np.testing.assert_allclose(sigma, 0.35)

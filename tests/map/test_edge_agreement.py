@@ -61,10 +61,7 @@ def test_without_overlap_the_default_applies(rng, case):
     assert bend(views, CAMERA) == DEFAULT_BEND
 
 
-def test_consistent_views_have_no_drift(rng):
-    assert bend(flight(rng, np.zeros(20)), CAMERA) < 1e-6
-
-
-def test_a_common_error_is_unobservable(rng):
+@pytest.mark.parametrize(("common", "most"), [(0.0, 1e-6), (0.1, 0.01)])
+def test_consistent_views_have_no_drift_and_a_common_error_is_unobservable(rng, common, most):
     """Which is why `SHARED` is more than one."""
-    assert bend(flight(rng, np.full(20, 0.1)), CAMERA) < 0.01
+    assert bend(flight(rng, np.full(20, common)), CAMERA) < most

@@ -52,18 +52,3 @@ def test_inverted_or_random_depth_and_a_single_depth_are_no_fit(scene, rng):
     assert fit_inverse(1.0 / relative, z) is None
     assert fit_inverse(rng.uniform(0.5, 3.0, len(z)), z * np.exp(rng.normal(0.0, 1.5, len(z)))) is None
     assert fit_inverse(np.full(50, 2.0), np.full(50, 3.0)) is None
-
-
-def test_inverted_depth_is_no_fit(scene):
-    z, relative = scene
-    assert fit_inverse(1.0 / relative, z) is None
-
-
-def test_noise_is_no_fit(scene, rng):
-    z, _ = scene
-    assert fit_inverse(rng.uniform(0.5, 3.0, len(z)), z * np.exp(rng.normal(0.0, 1.5, len(z)))) is None
-
-
-def test_anchors_at_one_depth_do_not_determine_the_shift():
-    fit = fit_inverse(np.full(50, 2.0), np.full(50, 3.0))
-    assert fit is None

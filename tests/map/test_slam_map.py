@@ -95,7 +95,7 @@ class Scribbler:
         assert (length < 1.0 + 1e-9).all()
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_map_stays_consistent_under_random_changes(seed):
     scribbler = Scribbler(seed)
     moves = [getattr(Scribbler, name) for name in MOVES]
@@ -183,14 +183,6 @@ def test_frames_of_a_removed_keyframe_stay_in_their_submap(rng):
     np.testing.assert_allclose(points.map.pose_of(mine.id), before)
     first.T_c_w = first.T_c_w @ moved
     np.testing.assert_allclose(points.map.pose_of(mine.id), before @ moved, atol=1e-12)
-
-
-def test_the_number_of_an_empty_submap_is_reused(rng):
-    points = PointMap(rng, 300, 2)
-    for begun in ("dark", "still dark"):
-        points.map.begin_piece(begun)
-        points.map.add_keyframe(points.keyframes[points.map.piece])
-    assert points.map.piece == 0
 
 
 def test_an_anchor_seen_at_a_coarse_level_is_seen_at_the_finest_from_farther_off(rng):
