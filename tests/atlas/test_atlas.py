@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map
+from point_map import CAMERA, SCALE_FACTOR, PointMap, add_anchors, check_map, edge_points
 
 from edgeslam_torch.atlas import links
 from edgeslam_torch.atlas.atlas import Atlas
 from edgeslam_torch.atlas.links import agreed_scale, link, log_ratios, on_one_plane, view_of
-from edgeslam_torch.atlas.place_recognition import revisit_candidates
 from edgeslam_torch.atlas.relaxation import move
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.atlas.submap_graph import SubmapGraph
@@ -17,9 +16,8 @@ from edgeslam_torch.config import EdgeConfig, OrbConfig, TrackingConfig
 from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.geometry import se3, sim3
-from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.map.trajectory import TrajectoryLog
-from edgeslam_torch.mapping.edges.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.relocaliser import match_keyframe
 from edgeslam_torch.tracking.tracker import Tracker
@@ -43,13 +41,8 @@ class Pieces:
         later = points.keyframes[4:]
         known = np.unique(np.concatenate(points.point_of[4:]))
         anchor_of = np.full(len(points.world.p_w), -1)
-        anchor_of[known] = self.map.anchors.add(
-            sim3.transform(misplaced, points.world.p_w[known]),
-            words(points.descriptors[known]),
-            4,
-            False,
-            np.zeros((len(known), 3), np.uint8),
-        )
+        p_w = sim3.transform(misplaced, points.world.p_w[known])
+        anchor_of[known] = add_anchors(self.map, p_w, points.descriptors[known], 4)
         for keyframe, seen in zip(later, points.point_of[4:], strict=True):
             keyframe.words = words(points.descriptors[seen])
             keyframe.T_c_w = sim3.moved_camera(misplaced, keyframe.T_c_w)
@@ -127,7 +120,7 @@ def test_inconsistent_links_do_not_merge_submaps(rng):
     anchors = pieces.map.anchors
     for n, keyframe in enumerate(pieces.keyframes[4:]):
         own = keyframe.anchor[keyframe.anchor >= 0]
-        ids = anchors.add(anchors.p_w[own], anchors.words[own], 9, False, np.zeros((len(own), 3), np.uint8))
+        ids = add_anchors(pieces.map, anchors.p_w[own], anchors.words[own], 9)
         pieces.map.forget_observations(keyframe, keyframe.keypoints_with_anchor()[:0])
         S = sim3.exp(np.array([0, 0, 0, 0, 0, 0, 0.25 * n]))
         anchors.p_w[ids] = sim3.transform(S, anchors.p_w[own])
@@ -163,27 +156,12 @@ def test_inconsistent_depths_give_no_scale(rng):
     assert agreed_scale(log_ratios(pieces.tracker, keyframe, track)) is None
 
 
-def test_candidates_are_the_keyframes_of_the_same_view(rng):
-    pieces = Pieces(rng)
-    found = revisit_candidates(pieces.map, pieces.keyframes[4].words, pieces.keyframes[:4], 3)
-    assert len(found) == 3
-    stranger = rng.integers(0, 2**63, (500, 4)).astype(np.uint64)
-    assert revisit_candidates(pieces.map, stranger, pieces.keyframes[:4], 3) == []
-    assert revisit_candidates(pieces.map, stranger[:0], pieces.keyframes[:4], 3) == []
-    assert revisit_candidates(pieces.map, stranger, [], 3) == []
-
-
 def test_transforming_a_submap_preserves_its_projections(rng):
     pieces = Pieces(rng)
     slam_map, anchors = pieces.map, pieces.map.anchors
     first, last = pieces.keyframes[0], pieces.keyframes[7]
     p_c = np.array([[0.1, 0.2, 2.0]])
-    none = np.zeros((1, 3), np.uint8)
-    for keyframe in (first, last):
-        one = np.ones(1)
-        pieces.edges.hosts.append(
-            EdgePoints(keyframe.id, p_c[:, :2], p_c[:, :2], p_c.copy(), 0.1 * one, none, one.astype(np.int32))
-        )
+    pieces.edges.hosts += [edge_points(keyframe.id, p_c.copy(), sigma=np.full(1, 0.1)) for keyframe in (first, last)]
     held = last.anchor[last.anchor >= 0]
     anchors.from_depth[held[0]] = True
     anchors.rest_on_prior(held[:1], last.id, last.centre_w, np.array([[0.5, 0.1]]))
@@ -226,28 +204,6 @@ def test_the_smaller_submap_is_transformed_to_the_larger(rng, smaller):
     assert {k // 4 for k in join.scale_change} == {smaller}
     to_larger = umeyama(truth[larger], before[larger])
     np.testing.assert_allclose(after, to_larger.points(truth), atol=0.03)
-
-
-def test_a_static_camera_gives_one_link(rng):
-    """The same image twice proves no more than once."""
-    pieces = Pieces(rng)
-    slam_map, anchors, atlas = pieces.map, pieces.map.anchors, pieces.atlas()
-    only = pieces.keyframes[4]
-    held = only.keypoints_with_anchor()
-    p_w, its_words = anchors.p_w[only.anchor[held]].copy(), anchors.words[only.anchor[held]].copy()
-    for keyframe in pieces.keyframes[4:]:
-        slam_map.forget_observations(keyframe, keyframe.keypoints_with_anchor())
-    assert atlas.update() is None
-    ids = anchors.add(p_w, its_words, 8, False, np.zeros((len(held), 3), np.uint8))
-    twins = [make_keyframe(slam_map.next_keyframe_id() + i, 50 + i, 5.0, only.T_c_w, only.features) for i in (0, 1)]
-    for twin in twins:
-        twin.words = only.words
-        twin.anchor[held] = ids
-        slam_map.add_keyframe(twin)
-    slam_map.refresh_anchors(ids)
-    for twin, other in zip(twins, pieces.keyframes[2:4], strict=True):
-        assert link(pieces.tracker, twin, other) is not None
-    assert atlas.update() is None
 
 
 def test_planarity_is_invariant_to_position_and_size(rng):

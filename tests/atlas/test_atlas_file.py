@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map
+from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map, edge_points
 
 from edgeslam_torch.atlas.atlas_file import COLUMNS, HEADER_KEY, check_fits, is_atlas, read_atlas, write_atlas
 from edgeslam_torch.atlas.saved import Unit, pack, unpack
@@ -15,7 +15,7 @@ from edgeslam_torch.files.tensor_file import write_tensors
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.edges.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.types import ScaleEstimate
 
 S = sim3.exp(np.array([0.5, -0.8, 0.3, 0.4, -0.3, 0.6, np.log(1.4)]))
@@ -35,11 +35,9 @@ class Flown:
         for keyframe in (gone, points.keyframes[4]):
             uv = rng.uniform(10, 400, (7, 2))
             p_c = CAMERA.back_project(uv, rng.uniform(1, 3, 7))
-            ones = np.ones(7)
-            colour = rng.integers(0, 255, (7, 3)).astype(np.uint8)
-            self.edges.hosts.append(
-                EdgePoints(keyframe.id, uv, uv / 500, p_c, 0.1 * ones, colour, 3 * ones.astype(np.int32))
-            )
+            own = {"normal": uv / 500, "colour": rng.integers(0, 255, (7, 3)).astype(np.uint8)}
+            own |= {"sigma": np.full(7, 0.1), "observations": np.full(7, 3, np.int32)}
+            self.edges.hosts.append(edge_points(keyframe.id, p_c, uv=uv, **own))
         anchors = self.map.anchors
         self.guessed = points.keyframes[3].anchor[points.keyframes[3].anchor >= 0][:4]
         anchors.from_depth[self.guessed] = True

@@ -46,20 +46,6 @@ def test_late_measurements_end_where_punctual_ones_do(rng):
     np.testing.assert_allclose(a.covariance, b.covariance, rtol=0.02, atol=1e-7)
 
 
-def test_any_order_inside_the_buffer_gives_the_same_state(rng):
-    samples, visual = telemetry(rng, 20), increments(rng, 8)
-    ordered = BufferedEkf(CONFIG)
-    shuffled = BufferedEkf(CONFIG)
-    for s in samples:
-        ordered.add_telemetry(s)
-    for k in [0, 19, *rng.permutation(np.arange(1, 19))]:
-        shuffled.add_telemetry(samples[k])
-    for ekf in (ordered, shuffled):
-        for v in visual:
-            ekf.add_relative(*v, PoseSigma(0.004, 0.003))
-    np.testing.assert_allclose(ordered.state_at(1.9).p_w, shuffled.state_at(1.9).p_w, atol=1e-12)
-
-
 def test_vision_that_disagrees_for_long_is_believed_in_the_end(rng):
     ekf = BufferedEkf(CONFIG)
     T = np.eye(4)
@@ -72,17 +58,6 @@ def test_vision_that_disagrees_for_long_is_believed_in_the_end(rng):
     assert counts["visual refused"] >= RECOVERS_AFTER - 1
     assert counts["visual recovered"] >= 1
     assert ekf.state_at(3.9).p_w[0] > 1.0
-
-
-def test_bias_of_the_velocity_is_found_from_relative_poses(rng):
-    ekf = BufferedEkf(FusionConfig(sigma_bias_m_s=0.1))
-    T = np.eye(4)
-    T[:3, 3] = [0.03, 0.0, 0.0]  # 0.3 m/s, while telemetry says 0.38
-    for k in range(200):
-        ekf.add_telemetry(TelemetrySample(0.1 * k, np.array([0.38, 0.0, 0.0]), np.zeros(3), battery=1.0))
-        if k > 0:
-            ekf.add_relative(0.1 * (k - 1), 0.1 * k, T, PoseSigma(0.003, 0.003))
-    assert ekf.state_at(19.9).velocity_bias_m_s[0] == pytest.approx(0.08, abs=0.01)
 
 
 def test_a_drone_that_hovers_unseen_stays_where_it_was():

@@ -182,24 +182,3 @@ def test_without_telemetry_the_present_is_constant_velocity():
     ahead = 2.0 * motion.T_w_c[-1, :3, 3] - motion.T_w_c[-2, :3, 3]
     np.testing.assert_allclose(now.T_w_c[:3, 3], ahead, atol=1e-9)
     np.testing.assert_allclose(now.velocity_w, (motion.T_w_c[-1] - motion.T_w_c[-2])[:3, 3] / 0.05, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_the_delay_is_right_whatever_the_phase_of_the_packets(seed):
-    """Frames at 20 Hz and state messages at 10 Hz in step: readings interpolated half-way are less noisy, and a search
-    that does not know it prefers delays between the steps (0.36 or 0.44 s for 0.40)."""
-    t = np.arange(0.0, 20.0, 0.05)
-    T = np.tile(np.eye(4), (len(t), 1, 1))
-    yaw, pitch = 0.15 * np.sin(0.5 * t), 0.03 * np.sin(0.8 * t)  # gentle: whole degrees hide much of it
-    T[:, :3, :3] = Rotation.from_euler("ZYX", np.stack([yaw, pitch, 0.0 * t], axis=1)).as_matrix()
-    T[:, :3, 3] = np.stack([0.6 * np.sin(0.6 * t), 0.5 * np.sin(0.45 * t + 1.0), 1.2 + 0.2 * np.sin(0.7 * t)], axis=1)
-    T = T @ T_B_C
-    faults, rng = TelemetryFaults(video_delay_s=DELAY_S), np.random.default_rng(seed)
-    fusion = MotionFusion(FusionConfig(), T_B_C)
-    fusion.add_telemetry(simulate(np.random.default_rng(seed), t, T, T_B_C, faults=faults).samples())
-    for stamp, pose in zip(t.tolist(), T, strict=True):
-        pose[:3, 3] += rng.normal(0.0, 0.001, 3)
-        fusion.add_visual(stamp, pose, 0.001, 0.0005)
-    assert fusion.delay_s == pytest.approx(DELAY_S, abs=0.025)
-    assert abs(fusion.delay_s - DELAY_S) < 3.0 * fusion.flight.delay_sigma_s

@@ -11,8 +11,6 @@ from swung import T_B_C, at_once, swinging
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.motion import MotionFusion
-from edgeslam_torch.estimation.scale.belief import ScaleBelief
-from edgeslam_torch.estimation.scale.camera_mount import Turned
 from edgeslam_torch.estimation.scale.depth_scale import DepthRatio
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
     Agreement,
@@ -89,16 +87,6 @@ def test_a_verdict_is_kept_until_contradicted_and_velocities_rest_on_attitude():
         used.append(trust.velocity)
         assert trust.velocity == (trust.warnings() == [])
     assert used == [True, True, False, True, False]
-
-
-@pytest.mark.parametrize("correlation", [0.3, -0.3])
-def test_few_height_changes_count_beside_validated_velocities_unless_they_go_the_other_way(correlation):
-    trust = SensorGate()
-    trust.judge(Reading.VELOCITY, Agreement(0.95, 20))
-    assert trust.height(Reading.BARO), "before any comparison"
-    trust.judge(Reading.BARO, Agreement(correlation, 6, dimensions=1))
-    assert trust.verdict(Reading.BARO) is Verdict.OPEN
-    assert trust.height(Reading.BARO) == (correlation > 0.0)
 
 
 # --- flights -------------------------------------------------------------------------------------------------------
@@ -242,25 +230,6 @@ def sideways_late(from_s, end_s):
     return replace(motion, T_w_c=T)
 
 
-def test_motion_along_one_axis_proves_nothing_of_another(told_of):
-    """Velocities that agree so far do not pull the map along an axis that has not moved yet."""
-    motion = sideways_late(8.0, 9.0)
-    seen = replace(motion, stamps_s=motion.stamps_s[:166], T_w_c=motion.T_w_c[:166])
-
-    def feed(fusion, motion, gauge, samples):
-        fusion.add_telemetry(samples)
-        fusion.add_earlier(seen.stamps_s, gauge.T_m_c[:166], gauge.sigma_t, gauge.sigma_r)
-        fusion.revise(seen.stamps_s, gauge.T_m_c[:166])
-
-    _, fusion, gauge = told_of(motion, column("velocity_m_s", 1, np.negative), feed)
-    asked = (motion.stamps_s > 7.9) & (motion.stamps_s < 8.75)
-    p = gauge.T_m_c[asked][::4, :3, 3]
-    reported = fusion.telemetry().positions(motion.stamps_s[asked][::4], p)
-    assert fusion.telemetry().velocity
-    chi2 = p.ravel() @ reported.information @ p.ravel() - 2 * reported.vector @ p.ravel() + reported.constant
-    assert chi2 < 4.0 * reported.rows
-
-
 def test_a_column_is_proven_by_motion_along_its_axis(told_of):
     (_, quiet, _), moved = (
         told_of(sideways_late(8.0, end_s), right)[1].telemetry().gain_sigma for end_s in (8.0, 12.0)
@@ -362,29 +331,6 @@ def test_heights_that_do_not_climb_with_the_images_are_not_used(told_of, change)
 
 
 # --- what constrains the map --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("beliefs", "speaks"),
-    [
-        ({"telemetry": (1.0, 0.35), "height": (1.0, 0.35)}, True),
-        ({"height": (1.0, 0.1)}, False),
-        ({"telemetry": (10.0, 0.1), "height": (1.0, 0.1), "depth": (1.0, 0.15)}, False),
-        ({"telemetry": (10.0, 0.1), "height": (1.0, 0.1)}, False),
-    ],
-)
-def test_velocities_constrain_the_map_only_at_a_consistent_scale_of_their_own(beliefs, speaks):
-    """At that of heights alone, velocities in another unit would stretch the map by as much."""
-    fusion = MotionFusion(FusionConfig(), T_B_C)
-    fusion.orientation.found = Turned(np.eye(3), np.eye(3), np.zeros(3))
-    fusion.orientation.began_upright = True
-    trust = fusion.flight.trust
-    trust.judge(Reading.VELOCITY, Agreement(0.99, 30))
-    found = {name: ScaleBelief(math.log(value), sigma, name) for name, (value, sigma) in beliefs.items()}
-    for _ in range(100 if found.pop("depth", None) else 0):
-        fusion.metres.add_depth_ratio(DepthRatio(0.0, 0.05))
-    fusion.metres.take(found, None, trust)
-    assert fusion.telemetry().velocity is speaks
 
 
 def test_gravity_constrains_an_upright_map_before_the_scale_is_known():

@@ -40,13 +40,6 @@ def test_hysteresis_keeps_pixels_connected_to_a_strong_one():
     assert not hysteresis(np.zeros_like(candidate), strong).any()
 
 
-def test_batch_is_each_image_by_itself():
-    greys = [cv2.cvtColor(views()[i], cv2.COLOR_BGR2GRAY) for i in (0, 1)]
-    together = canny_batch(as_batch(greys), 40.0, 100.0)
-    for mask, grey in zip(together, greys, strict=True):
-        assert torch.equal(mask, canny_batch(as_batch([grey]), 40.0, 100.0)[0])
-
-
 def test_step_is_one_pixel_wide_and_where_it_is():
     grey = np.full((60, 80), 60, np.uint8)
     grey[:, 40:] = 160

@@ -139,10 +139,3 @@ def check_turning(grey, least):
 
 def test_turning_a_rendered_image_turns_its_junctions(rng):
     check_turning(frame(rng)[0], least=30)
-
-
-@pytest.mark.data
-@pytest.mark.parametrize("sequence", ["tum_fr1_xyz", "7scenes_redkitchen"])
-def test_turning_a_real_image_turns_its_junctions(sequence, data_dir):
-    image = min((data_dir / sequence).rglob("*.jpg"))
-    check_turning(cv2.imread(str(image), cv2.IMREAD_GRAYSCALE), least=8)

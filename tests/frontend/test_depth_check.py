@@ -90,8 +90,3 @@ def test_a_map_of_mostly_bad_pixels_is_rejected():
     depth = depth_map(2.0)
     depth.depth_m[:121] = np.nan
     assert CheckedDepth(lambda image, camera: depth)(IMAGE, CAMERA) is None
-
-
-def test_a_function_without_depth_is_no_failure():
-    checked = CheckedDepth(lambda image, camera: None)
-    assert checked(IMAGE, CAMERA) is None

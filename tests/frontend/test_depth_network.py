@@ -40,17 +40,6 @@ def test_backends_agree(weights, image):
     np.testing.assert_allclose(a.sigma_log, b.sigma_log, rtol=1e-3)
 
 
-def test_preprocessing_is_whole_image_rgb_in_minus_one_to_one():
-    image = np.zeros((64, 64, 3), np.uint8)
-    image[:, :32, 0] = 255  # left half blue
-    x = preprocess(image, 32, 32, Metadata())
-    assert x.shape == (1, 3, 32, 32)
-    assert x.dtype == np.float32
-    np.testing.assert_allclose(x[0, 2, :, :16], 1.0, atol=1e-6)
-    np.testing.assert_allclose(x[0, 2, :, 16:], -1.0, atol=1e-6)
-    np.testing.assert_allclose(x[0, 0], -1.0, atol=1e-6)
-
-
 @pytest.mark.parametrize("size", [(480, 640), (480, 752), (720, 960), (1080, 1920), (640, 480), (240, 320)])
 def test_network_input_has_the_images_shape_at_the_training_area(size):
     metadata = Metadata(input_height=192, input_width=256)

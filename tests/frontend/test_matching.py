@@ -82,25 +82,3 @@ def test_whole_images_match_both_ways_or_not_at_all():
     bits = [[0] * 4, [3, 0, 0, 0], [1, 0, 0, 0], [2**64 - 1] * 4]
     a, b = np.array([bits[1], bits[0]], np.uint64), np.array([bits[0], bits[3]], np.uint64)
     assert dict(zip(match_all(a, b, 64, 0.8).query, match_all(a, b, 64, 0.8).train, strict=True)) == {1: 0}
-
-
-def test_unrelated_descriptors_do_not_match(rng):
-    """256 fair coins differ in 128 +- 8 places."""
-    assert len(match_all(random_words(rng, 200), random_words(rng, 200), 64, 0.85)) == 0
-
-
-def test_no_candidates():
-    none = np.zeros(0, np.int64)
-    assert len(best_pairs(none, none, none, 64, 0.8)) == 0
-
-
-def test_guided_search_over_the_whole_image_finds_what_brute_force_finds(rng):
-    a = random_words(rng, 80)
-    order = rng.permutation(80)
-    b = flipped(rng, a, 30)[order]
-    uv = rng.uniform(0, 100, (80, 2))
-    query, train = KeypointGrid(uv[order]).near(uv, np.full(80, 200.0))
-    assert len(query) == 80 * 80
-    guided = best_pairs(query, train, hamming(a[query], b[train]), 64, 0.85)
-    brute = match_all(a, b, 64, 0.85)
-    assert dict(zip(guided.query, guided.train, strict=True)) == dict(zip(brute.query, brute.train, strict=True))

@@ -86,18 +86,6 @@ def test_constant_image_has_no_keypoints(grey):
     assert len(features.octave) == len(features.angle_rad) == 0
 
 
-def test_with_many_corners_faint_ones_change_nothing():
-    grey = views()[0][..., 1].copy()
-    config = OrbConfig(features=400)
-    a, b = (OrbExtractor(c, CAMERA)(grey) for c in (config, OrbConfig(features=400, fast_faint=12)))
-    np.testing.assert_array_equal(a.uv, b.uv)
-
-
-def test_spread_takes_the_strongest_of_a_cell():
-    uv = np.tile([[10.0, 10.0]], (9, 1)).astype(np.float32)
-    assert spread(uv, np.arange(9.0), 640, 480, 3).tolist() == [6, 7, 8]
-
-
 def test_spread_is_as_even_as_the_corners_allow(rng):
     """Evenly detected corners: no quarter of the image gets more than a third of what is kept."""
     uv = rng.uniform([0, 0], [640, 480], (3000, 2)).astype(np.float32)

@@ -68,9 +68,3 @@ def test_copies_made_for_the_frame_rate_are_named_without_a_warning(rng):
     found, warning = seen([image for image in images for _ in range(2)], 24.0)
     assert found == [False, True] * 12
     assert warning is None
-
-
-def test_several_stretches_give_one_warning(rng):
-    still, other = room(rng), room(rng)
-    _, warning = seen([still] * 30 + [other] * 45)
-    assert "froze 2 times, the longest from 1.0 to 2.5 s" in warning

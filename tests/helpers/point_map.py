@@ -8,6 +8,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.mapping.edges.edge_map import EdgePoints
 from edgeslam_torch.types import FrameFeatures
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 319.5, 239.5)
@@ -47,10 +48,7 @@ class PointMap:
             count[self.point_of[v]] += 1
         points = np.flatnonzero(count >= 2)
         anchor_of = np.full(len(count), -1)
-        colour = np.zeros((len(points), 3), np.uint8)
-        anchor_of[points] = self.map.anchors.add(
-            self.world.p_w[points], words(self.descriptors[points]), 0, False, colour
-        )
+        anchor_of[points] = add_anchors(self.map, self.world.p_w[points], self.descriptors[points])
         for v in views:
             self.keyframes[v].anchor[:] = anchor_of[self.point_of[v]]
             self.map.add_keyframe(self.keyframes[v])
@@ -62,6 +60,21 @@ class PointMap:
         for keyframe in self.keyframes:
             other = np.flatnonzero((keyframe.anchor >= 0) & (keyframe.anchor % 2 != is_odd(keyframe.id)))
             self.map.forget_observations(keyframe, other)
+
+
+def add_anchors(slam_map, p_w, descriptors, host=0, guessed=False):
+    """Take black anchors into the map; descriptors as bytes or as words."""
+    bits = words(descriptors) if descriptors.dtype == np.uint8 else descriptors
+    return slam_map.anchors.add(p_w, bits, host, guessed, np.zeros((len(p_w), 3), np.uint8))
+
+
+def edge_points(id, p_c, camera=CAMERA, kind=EdgePoints, **changes):
+    """Black edges of a keyframe at points of its camera, across which images change along the rows."""
+    n = len(p_c)
+    normal = np.tile(np.float32([1.0, 0.0]), (n, 1))
+    record = {"uv": camera.project(p_c).astype(np.float32), "normal": normal, "p_c": p_c, "sigma": np.full(n, 0.01)}
+    record |= {"colour": np.zeros((n, 3), np.uint8), "observations": np.ones(n, np.int32)}
+    return kind(id, **(record | changes))
 
 
 def filled(rng, n_points=300, n_views=5, noise_px=0.0):

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from point_map import PointMap, check_map, filled, small_motion
+from point_map import PointMap, add_anchors, check_map, filled, small_motion
 
-from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.types import FrameFeatures
@@ -44,11 +43,9 @@ class Scribbler:
     def add_anchors(self):
         self.map.anchors.begin_pass()
         n = int(self.rng.integers(0, 12))
-        bits = words(self.rng.integers(0, 256, (n, 32), dtype=np.uint8))
+        bits = self.rng.integers(0, 256, (n, 32), dtype=np.uint8)
         guessed = bool(self.rng.random() < 0.2)
-        ids = self.map.anchors.add(
-            self.rng.normal(size=(n, 3)), bits, max(self.map.keyframes), guessed, np.zeros((n, 3), np.uint8)
-        )
+        ids = add_anchors(self.map, self.rng.normal(size=(n, 3)), bits, max(self.map.keyframes), guessed)
         for keyframe in {k.id: k for k in (self.keyframe(), self.keyframe(), self.keyframe())}.values():
             self.observe(keyframe, ids)
 
@@ -153,7 +150,7 @@ def test_a_keyframe_belongs_to_the_submap_in_which_it_was_tracked(rng):
     first, second, again = points.keyframes
     points.map.begin_piece("first")
     points.map.add_keyframe(first)
-    ids = points.map.anchors.add(np.zeros((1, 3)), first.words[:1], 0, True, np.zeros((1, 3), np.uint8))
+    ids = add_anchors(points.map, np.zeros((1, 3)), first.words[:1], guessed=True)
     points.map.observe(first, np.array([0]), ids)
     points.map.begin_piece("second")
     points.map.add_keyframe(second)
@@ -170,7 +167,7 @@ def test_frames_of_a_removed_keyframe_stay_in_their_submap(rng):
     first, other, mine = points.keyframes
     points.map.begin_piece("first")
     points.map.add_keyframe(first)
-    ids = points.map.anchors.add(np.zeros((1, 3)), first.words[:1], 0, True, np.zeros((1, 3), np.uint8))
+    ids = add_anchors(points.map, np.zeros((1, 3)), first.words[:1], guessed=True)
     points.map.observe(first, np.array([0]), ids)
     points.map.begin_piece("second")
     points.map.add_keyframe(other)

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from point_map import add_anchors
 from rendered import CAMERA, film, sideways, stairs_world, wall
 
 from edgeslam_torch.config import OrbConfig
 from edgeslam_torch.frontend.image import as_grey
-from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import make_keyframe
@@ -31,7 +31,7 @@ def a_map(flight):
     first = keyframes[0]
     u, v = np.rint(first.features.uv).astype(int).T
     p_w = se3.transform(flight.T_w_c[0], CAMERA.back_project(first.features.uv, flight.depth_m[0][v, u]))
-    ids = slam_map.anchors.add(p_w, words(first.features.descriptors), 0, False, np.zeros((len(p_w), 3), np.uint8))
+    ids = add_anchors(slam_map, p_w, first.features.descriptors)
     first.anchor[:] = ids
     for other in keyframes[1:]:
         uv = CAMERA.project(se3.transform(other.T_c_w, p_w))

@@ -4,13 +4,12 @@ import warnings
 
 import numpy as np
 import pytest
-from point_map import CAMERA, filled, small_motion
+from point_map import CAMERA, edge_points, filled, small_motion
 
 from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.map.depth_prior import depth_prior
 from edgeslam_torch.map.edge_agreement import AGREE_PX, DEFAULT_BEND, PaintedEdges
-from edgeslam_torch.mapping.edges.edge_map import PRIOR_CELL_PX, EdgeMap, EdgePoints, fuse_voxels
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap, fuse_voxels
 
 
 def test_two_points_of_one_cell_worked_by_hand():
@@ -24,28 +23,8 @@ def test_two_points_of_one_cell_worked_by_hand():
     assert cloud.observations.tolist() == [5, 3]
 
 
-def test_fused_points_stay_in_their_cells(rng):
-    p = rng.uniform(-1, 1, (5000, 3))
-    cloud = fuse_voxels(p, np.full(5000, 0.01), np.zeros((5000, 3), np.uint8), np.full(5000, 2), 0.1)
-    cells = np.floor(cloud.p_w / 0.1).astype(int)
-    assert len(np.unique(cells, axis=0)) == len(cells)
-    assert len(cells) == len(np.unique(np.floor(p / 0.1).astype(int), axis=0))
-
-
 def host(points, id, p_w, **changes):
-    T_c_w = points.map.pose_of(id)
-    p_c = se3.transform(T_c_w, p_w)
-    n = len(p_w)
-    record = {
-        "keyframe_id": id,
-        "uv": CAMERA.project(p_c).astype(np.float32),
-        "normal": np.tile(np.float32([1.0, 0.0]), (n, 1)),
-        "p_c": p_c,
-        "sigma": np.full(n, 0.01),
-        "colour": np.zeros((n, 3), np.uint8),
-        "observations": np.ones(n, np.int32),
-    }
-    return EdgePoints(**(record | changes))
+    return edge_points(id, se3.transform(points.map.pose_of(id), p_w), **changes)
 
 
 @pytest.fixture
@@ -68,17 +47,6 @@ def test_consistent_points_of_two_keyframes_count_twice(points):
     assert set(range(10)) <= set(lonely)
     assert len(lonely) < 15  # another edge pixel may lie nearer by chance
     assert (b.observations[:10] == 1).all()
-
-
-def test_points_behind_the_other_keyframe_do_not_count(points, rng):
-    p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:40]
-    a, b = host(points, 0, p_w), host(points, 1, p_w)
-    points.keyframes[1].T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ points.keyframes[1].T_c_w
-    edges = edge_map(points)
-    edges.add(b)
-    edges.add(a)
-    assert (a.observations == 1).all()
-    assert (b.observations == 1).all()
 
 
 def test_edge_points_move_with_their_keyframe(points, rng):
@@ -125,26 +93,6 @@ def test_sigma_of_a_point_includes_map_deformation(points):
     np.testing.assert_array_equal(seen.sigma, 0.01)  # the edge's own, which the solver uses, stays
 
 
-def test_edges_of_one_cell_share_a_prior_near_their_own(points, rng):
-    uv = rng.integers(0, (CAMERA.width, CAMERA.height), (600, 2)).astype(np.float32)
-    keyframe = points.keyframes[0]
-    prior, sigma = edge_map(points)._prior(keyframe, uv)
-    own, own_sigma = depth_prior(keyframe, uv, points.map.anchors)
-    np.testing.assert_array_equal(sigma, own_sigma)
-    assert np.median(np.abs(np.log(prior / own))) < 0.05
-    _, cell = np.unique(uv // PRIOR_CELL_PX, axis=0, return_inverse=True)
-    assert len(np.unique(prior)) <= cell.max() + 1 < len(uv)
-
-
-def test_keyframe_without_image_or_partners_is_skipped(points):
-    some = edge_map(points)
-    for keyframe in points.keyframes:
-        some.announce(keyframe)
-    points.map.remove_keyframe(points.keyframes[2])
-    some.update(everything=True)
-    assert some.hosts == []
-
-
 def test_number_of_points_is_bounded(points):
     """Old points that one keyframe alone saw go first, then the oldest are thinned; the newest stay whole."""
     some = edge_map(points, max_points=1000)
@@ -185,21 +133,6 @@ def test_keyframes_without_a_measured_edge_are_an_empty_map(points):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert edges.points().p_w.shape == (0, 3)
-
-
-def test_the_same_pixel_at_another_depth_is_another_edge(points):
-    """Measured by the second keyframe a fifth deeper along the first one's rays: same pixels there, another depth."""
-    p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:60]
-    centre = points.keyframes[0].centre_w
-    deeper = centre + 1.2 * (p_w - centre)
-    counts = []
-    for theirs in (p_w, deeper):
-        edges = edge_map(points)
-        edges.add(host(points, 1, theirs))
-        edges.add(host(points, 0, p_w))
-        counts.append((edges.hosts[1].observations == 2).mean())
-    assert counts[0] > 0.9
-    assert counts[1] < 0.1
 
 
 def followed(points, grown, on_prior=0):

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from point_map import CAMERA, PointMap, check_map, filled
+from point_map import CAMERA, PointMap, add_anchors, check_map, filled
 
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
-from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.mapping.fuse import fuse_all, fuse_new, merge
 
 
@@ -31,9 +30,7 @@ def test_duplicates_are_merged(rng, join):
         at = np.flatnonzero(np.isin(points.point_of[k.id], twice))
         points.map.forget_observations(k, at)
     twice = twice[points.map.anchors.alive[anchor_of[twice]]]
-    ids = points.map.anchors.add(
-        points.world.p_w[twice], words(points.descriptors[twice]), 3, False, np.zeros((len(twice), 3), np.uint8)
-    )
+    ids = add_anchors(points.map, points.world.p_w[twice], points.descriptors[twice], 3)
     for k in (keyframe, other):
         keypoint_of = {p: i for i, p in enumerate(points.point_of[k.id])}
         points.map.observe(k, np.array([keypoint_of[p] for p in twice]), ids)
@@ -44,28 +41,13 @@ def test_duplicates_are_merged(rng, join):
     assert before - len(points.map.anchors) > 0.8 * len(twice)
 
 
-def test_missing_observations_are_found(rng):
-    """Also by keyframes that share nothing any more with those that hold the anchors."""
-    points = filled(rng, 300, 6)
-    last = points.keyframes[5]
-    held = last.anchor.copy()
-    points.map.forget_observations(last, last.keypoints_with_anchor())
-    alive = (held >= 0) & points.map.anchors.alive[held]
-    fuse_all(points.map, CAMERA)
-    check_map(points.map)
-    assert np.mean(last.anchor[alive] == held[alive]) > 0.8
-    assert not np.any((last.anchor >= 0) & (last.anchor != held)), "nothing wrong beside it"
-
-
 def test_of_duplicates_the_better_observed_anchor_is_kept(rng):
     points = PointMap(rng, 200, 5)
     anchor_of = points.fill()
     observations = points.map.anchors.observations
     well = anchor_of[(anchor_of >= 0)]
     well = well[observations[well] >= 4][:20]
-    doubles = points.map.anchors.add(
-        points.map.anchors.p_w[well], points.map.anchors.words[well], 4, False, np.zeros((len(well), 3), np.uint8)
-    )
+    doubles = add_anchors(points.map, points.map.anchors.p_w[well], points.map.anchors.words[well], 4)
     half = len(well) // 2
     pairs = [(well[:half], doubles[:half]), (doubles[half:], well[half:])]  # whichever of the two is named first
     merge(points.map, pairs)
@@ -74,11 +56,11 @@ def test_of_duplicates_the_better_observed_anchor_is_kept(rng):
     check_map(points.map)
 
 
-@pytest.mark.parametrize(("off_px", "found"), [(2.2, True), (2.8, False)])
-def test_a_distance_above_the_95_percent_quantile_is_no_duplicate(rng, off_px, found):
-    """Two degrees of freedom, one pixel: 2.45 px."""
-    points = filled(rng, 300, 4)
-    last = points.keyframes[3]
+@pytest.mark.parametrize(("off_px", "least", "most"), [(0.0, 0.8, 1.0), (2.2, 0.5, 1.0), (2.8, 0.0, 0.0)])
+def test_missing_observations_are_found_up_to_the_95_percent_quantile(rng, off_px, least, most):
+    """Of two degrees of freedom: 2.45 px. Also by keyframes that share nothing any more with those that hold them."""
+    points = filled(rng, 300, 6)
+    last = points.keyframes[5]
     held = last.anchor.copy()
     points.map.forget_observations(last, last.keypoints_with_anchor())
     alive = (held >= 0) & points.map.anchors.alive[held]
@@ -86,5 +68,7 @@ def test_a_distance_above_the_95_percent_quantile_is_no_duplicate(rng, off_px, f
     last.features = replace(last.features, uv=shifted)
     last.grid = KeypointGrid(shifted)
     fuse_all(points.map, CAMERA)
-    assert (np.mean(last.anchor[alive] == held[alive]) > 0.5) == found
-    assert found or not (last.anchor >= 0).any()
+    check_map(points.map)
+    assert least <= np.mean(last.anchor[alive] == held[alive]) <= most
+    wrong = (last.anchor >= 0) & (last.anchor != held)
+    assert wrong.mean() <= (0.05 if off_px else 0.0)

@@ -32,13 +32,9 @@ def test_a_force_other_than_gravity_gives_nothing(rng, kwargs):
     assert up_by_gravity(*flight(rng, **kwargs)) is None
 
 
-def test_readings_of_another_time_give_nothing(rng):
+def test_readings_of_another_time_or_without_a_mount_give_nothing(rng):
     felt, model, stamps_s, T = flight(rng)
     assert up_by_gravity(felt, model, stamps_s + 1000.0, T) is None
-
-
-def test_without_a_mount_the_vertical_is_unknown(rng):
-    felt, _, stamps_s, T = flight(rng)
     assert up_by_gravity(felt, ImuModel(), stamps_s, T) is None
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from point_map import CAMERA, PointMap, check_map, filled, small_motion
+from point_map import CAMERA, PointMap, add_anchors, check_map, filled, small_motion
 
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import words
@@ -33,13 +33,8 @@ def drifted(rng, drift, same_place=True):
         points.descriptors = rng.integers(0, 256, points.descriptors.shape, dtype=np.uint8)
         last.words = words(points.descriptors[seen])
     anchor_of = np.full(len(points.world.p_w), -1)
-    anchor_of[known] = points.map.anchors.add(
-        se3.transform(drift, points.world.p_w[known]),
-        words(points.descriptors[known]),
-        3,
-        False,
-        np.zeros((len(known), 3), np.uint8),
-    )
+    p_w = se3.transform(drift, points.world.p_w[known])
+    anchor_of[known] = add_anchors(points.map, p_w, points.descriptors[known], 3)
     for v in LATER:
         keyframe = points.keyframes[v]
         keyframe.T_c_w = keyframe.T_c_w @ se3.inverse(drift)
@@ -88,12 +83,6 @@ def test_covisible_keyframes_are_skipped(rng):
     assert revisit_candidate(points.map, points.keyframes[0]) is None, "none is older"
     assert all(reobserve(points.map, CAMERA, keyframe) is None for keyframe in points.keyframes)
     check_map(points.map)
-
-
-def test_keyframe_without_anchors_has_no_revisit_candidate(rng):
-    points = filled(rng, 300, 3)
-    points.map.forget_observations(points.keyframes[2], points.keyframes[2].keypoints_with_anchor())
-    assert revisit_candidate(points.map, points.keyframes[2]) is None
 
 
 def test_a_place_with_few_inliers_is_not_matched(rng, drift):

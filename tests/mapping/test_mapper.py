@@ -120,17 +120,6 @@ def test_the_only_views_of_a_place_are_kept_in_a_full_map(rng, monkeypatch):
     check_map(points.map)
 
 
-def test_a_map_of_unique_views_grows_to_twice_the_limit(rng, monkeypatch):
-    points = filled(rng, 900, 30)
-    for keyframe in points.keyframes:  # each anchor is left to two neighbours
-        others = keyframe.anchor % 15 != keyframe.id // 2
-        points.map.forget_observations(keyframe, np.flatnonzero((keyframe.anchor >= 0) & others))
-    monkeypatch.setattr("edgeslam_torch.mapping.mapper.REDUNDANCY", 1.0)
-    mapper = make_mapper(points, max_keyframes=12, window=5, window_fixed=5)
-    mapper.cull_keyframes(points.keyframes[-1])
-    assert len(points.map.keyframes) == 24
-
-
 def test_redundant_keyframes_are_removed_except_the_first_and_last(rng, monkeypatch):
     """Every point is seen from almost everywhere: of sixteen keyframes a few would do."""
     points = PointMap(rng, 300, 16)
@@ -147,14 +136,6 @@ def test_redundant_keyframes_are_removed_except_the_first_and_last(rng, monkeypa
         seen = points.map.anchors_seen_by(list(points.map.keyframes.values()))
         missed = np.setdiff1d(anchor_of[points.point_of[id]], seen)
         assert len(missed[missed >= 0]) < 0.4 * len(points.point_of[id])
-
-
-def test_keyframe_without_covisible_ones_is_inserted(rng):
-    points = PointMap(rng, 100, 3)
-    points.fill([0, 1])
-    insert(make_mapper(points), points, 2, np.full(100, -1))
-    check_map(points.map)
-    assert 2 in points.map.keyframes
 
 
 @pytest.mark.parametrize("settings", [{"window": 1}, {"max_keyframes": 10}, {"keyframe_parallax_deg": 0.0}])

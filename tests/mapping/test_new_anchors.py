@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from point_map import CAMERA, SCALE_FACTOR, PointMap
 
-from edgeslam_torch.frontend.matching import EMPTY, Matches
+from edgeslam_torch.frontend.matching import Matches
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
@@ -46,10 +46,6 @@ def test_keypoints_with_an_anchor_are_skipped(points):
     assert len(matched(points, points.depths(0))) == 0
 
 
-def test_unknown_prior_matches_nothing(points):
-    assert len(matched(points, np.full(len(points.point_of[0]), np.nan))) == 0
-
-
 def test_triangulated_points_are_exact(points):
     matches = matched(points, points.depths(0))
     p_w, sigma, used = triangulated(points, matches)
@@ -77,16 +73,6 @@ def test_wrong_pairs_do_not_triangulate(points, rng):
     train = np.roll([where[1][p] for p in common], 7)
     _, _, used = triangulated(points, Matches(query, train, np.zeros(len(query), int)))
     assert len(used) < 0.05 * len(query)
-
-
-def test_too_little_parallax_is_rejected(points):
-    matches = matched(points, points.depths(0))
-    assert len(triangulated(points, matches, 60.0)[2]) == 0
-
-
-def test_empty_input_gives_empty_output(points):
-    p_w, sigma, used = triangulated(points, EMPTY)
-    assert (p_w.shape, sigma.shape, used.shape) == ((0, 3), (0,), (0,))
 
 
 def test_a_level_that_contradicts_the_distance_is_rejected(points):
@@ -120,19 +106,3 @@ def test_a_similar_keypoint_off_the_epipolar_line_is_not_matched(points, rng):
     chosen = [right[q] == t for q, t in zip(found.query.tolist(), found.train.tolist(), strict=True) if t < 2 * n]
     assert len(chosen) > 0.7 * n
     assert np.mean(chosen) > 0.95
-
-
-def test_a_point_must_reproject_in_the_sharper_of_two_views(points):
-    """Six pixels across the line, half of them in each view: nothing at level 2, too much at level 0."""
-    a, b = points.keyframes[0], points.keyframes[1]
-    matches = matched(points, points.depths(0))
-    b.features.octave[:] = 2
-    assert len(triangulated(points, matches)[2]) > 0.6 * len(matches)
-    T = b.T_c_w @ se3.inverse(a.T_c_w)
-    p = CAMERA.back_project(a.features.uv, points.depths(0))
-    along = CAMERA.project(se3.transform(T, 1.01 * p)) - CAMERA.project(se3.transform(T, p))
-    along = (along / np.linalg.norm(along, axis=1, keepdims=True))[matches.query]
-    b.features.uv[matches.train] += (6.0 * np.stack([-along[:, 1], along[:, 0]], axis=1)).astype(np.float32)
-    assert len(triangulated(points, matches)[2]) < 0.1 * len(matches)
-    b.features.uv[matches.train] -= (3.0 * np.stack([-along[:, 1], along[:, 0]], axis=1)).astype(np.float32)
-    assert len(triangulated(points, matches)[2]) > 0.5 * len(matches)

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from point_map import CAMERA, filled
+from point_map import CAMERA, edge_points, filled
 
 from edgeslam_torch.config import DepthConfig, EdgeConfig, SlamConfig
 from edgeslam_torch.geometry import se3
@@ -51,9 +51,7 @@ def slam(points):
 def host(points, id, kind=EdgePoints):
     p_c = se3.transform(points.map.pose_of(id), numbered(points))
     number = np.repeat(np.arange(30, dtype=np.uint8)[:, None], 3, axis=1)
-    count = np.full(30, 3, np.int32)
-    uv, normal = CAMERA.project(p_c).astype(np.float32), np.tile(np.float32([1.0, 0.0]), (30, 1))
-    return kind(id, uv, normal, p_c, np.full(30, 0.01), number, count)
+    return edge_points(id, p_c, kind=kind, colour=number, observations=np.full(30, 3, np.int32))
 
 
 def numbered(points):
@@ -117,16 +115,3 @@ def test_concurrent_replacement_of_anchors_is_atomic(slam):
     cloud = slam.anchors()
     assert len(cloud.p_w) == len(alive) > 100
     assert np.unique(cloud.colour).tolist() == np.unique(cloud.sigma_m).tolist()
-
-
-def test_concurrent_removal_of_a_keyframe_is_atomic(slam):
-    last = slam.map.keyframes[2]
-
-    class Meddled(dict):
-        def __getitem__(self, id):
-            if id == 0:
-                beside(slam.map.lock, lambda: slam.map.remove_keyframe(last))
-            return super().__getitem__(id)
-
-    slam.map.keyframes = Meddled(slam.map.keyframes)
-    assert [k.id for k in slam.keyframes()] in ([0, 1], [0, 1, 2])

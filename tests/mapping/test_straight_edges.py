@@ -58,21 +58,19 @@ def test_a_room_gives_the_vertical_of_a_tilted_map(rng, pitch_deg, roll_deg, ver
     assert np.radians(1.0) < up.sigma_rad < np.radians(4.0)
 
 
-@pytest.mark.parametrize("roll_deg", [90.0, -90.0, 80.0])
-def test_a_rotated_phone_gives_no_tilted_vertical(rng, roll_deg):
-    assert vertical(room(rng), cameras(roll_deg=roll_deg), DEPTH) is None
-
-
-def test_clutter_gives_no_vertical(rng):
-    assert vertical(room(rng, clutter=1.0, verticals=0.0), cameras(), DEPTH) is None
-
-
-def test_an_uncertain_focal_length_increases_sigma_or_rejects(rng):
-    assert vertical(room(rng), cameras(), DEPTH, focal_sigma=0.45) is None
-
-
-def test_few_segments_give_no_vertical(rng):
-    assert vertical(room(rng, per_keyframe=1), cameras(), DEPTH) is None
+@pytest.mark.parametrize(
+    ("of_room", "of_camera", "focal_sigma"),
+    [
+        *(({}, {"roll_deg": roll}, 0.0) for roll in (90.0, -90.0, 80.0)),  # a phone held upright
+        ({"clutter": 1.0, "verticals": 0.0}, {}, 0.0),
+        ({"per_keyframe": 1}, {}, 0.0),
+        ({}, {}, 0.45),
+    ],
+)
+def test_rotated_phones_clutter_few_segments_and_an_uncertain_lens_give_no_vertical(
+    rng, of_room, of_camera, focal_sigma
+):
+    assert vertical(room(rng, **of_room), cameras(**of_camera), DEPTH, focal_sigma=focal_sigma) is None
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.01])

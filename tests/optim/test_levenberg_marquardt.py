@@ -1,6 +1,5 @@
 """Levenberg-Marquardt on problems small enough to work by hand."""
 
-import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -78,15 +77,9 @@ def test_no_state_is_linearised_twice_and_the_best_is_returned():
     assert summary.accepted < 4
 
 
-def test_rejected_steps_count_and_raise_the_damping():
-    _, summary = minimise(Curve(), START, replace(MANY, max_iterations=3, mu=1e-9))
-    assert summary.iterations == 3
-    assert summary.accepted < 3  # the first full Gauss-Newton step overshoots
-    assert summary.stop is StopReason.MAX_ITERATIONS
-
-
-def test_stalls_when_no_step_helps():
-    end, summary = minimise(Curve(spoil=100.0), START, MANY)
+@pytest.mark.parametrize("spoil", [100.0, np.nan])
+def test_stalls_when_no_step_helps(spoil):
+    end, summary = minimise(Curve(spoil=spoil), START, MANY)
     assert summary.stop is StopReason.STALLED
     assert summary.accepted == 0
     np.testing.assert_array_equal(end.x, START)
@@ -94,12 +87,6 @@ def test_stalls_when_no_step_helps():
 
 def test_reports_singular_when_no_damping_helps():
     assert minimise(Curve(singular=True), START, MANY)[1].stop is StopReason.SINGULAR
-
-
-def test_non_finite_candidates_are_rejected():
-    end, summary = minimise(Curve(spoil=math.nan), START, MANY)
-    assert summary.stop is StopReason.STALLED
-    np.testing.assert_array_equal(end.x, START)
 
 
 def test_a_start_that_is_not_finite_ends_at_once():

@@ -1,6 +1,5 @@
 """Window refinement on clean, contaminated and degenerate synthetic worlds."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -97,22 +96,6 @@ def test_chi2_is_in_the_callers_order():
     np.testing.assert_allclose(result.chi2, expected, rtol=1e-9, atol=1e-20)
 
 
-def test_order_of_observations_does_not_matter(rng):
-    window = seeded_window(4, SMALL)
-    before = refine_window(window.problem, TIGHT)
-    after = refine_window(keep(window.problem, rng.permutation(len(window.problem.uv))), TIGHT)
-    assert after.cost_after == pytest.approx(before.cost_after, rel=1e-10)
-    np.testing.assert_allclose(after.T_c_w, before.T_c_w, atol=1e-7)
-
-
-def test_seeing_an_anchor_twice_weighs_double():
-    problem = points_only(seeded_window(5, SMALL)).problem
-    twice = keep(problem, np.r_[np.arange(len(problem.uv)), 0])
-    heavier = replace(problem, inv_sigma=np.where(np.arange(len(problem.uv)) == 0, 2**0.5, 1.0) * problem.inv_sigma)
-    config = replace(TIGHT, robust=False)
-    np.testing.assert_allclose(refine_window(twice, config).T_c_w, refine_window(heavier, config).T_c_w, atol=1e-9)
-
-
 def test_an_anchor_practically_at_infinity_disturbs_nothing():
     problem = points_only(seeded_window(5, SMALL)).problem
     held = replace(problem, scale_priors=(ScalePrior(0, 5, 0.6, 0.01),))
@@ -136,24 +119,6 @@ def test_an_anchor_practically_at_infinity_disturbs_nothing():
 # -- noise ----------------------------------------------------------------------------------------------------
 
 
-def test_twenty_starts_end_in_one_minimum(rng):
-    window = seeded_window(6, replace(SMALL, anchors=100, observations=400, edges=100, pairs=300))
-    costs = []
-    for _ in range(20):
-        T = window.T_c_w.copy()
-        for i in range(SMALL.fixed, SMALL.poses):
-            T[i] = se3.exp(np.repeat([0.03, 0.015], 3) * rng.normal(size=6)) @ T[i]
-        p_w = window.p_w + 0.05 * rng.normal(size=window.p_w.shape)
-        edges = window.problem.edges
-        assert edges is not None
-        depth = edges.prior * np.exp(0.2 * rng.normal(size=len(edges.prior)))
-        problem = replace(window.problem, T_c_w=T, p_w=p_w, edges=replace(edges, inverse_depth=depth))
-        result = refine_window(problem, TIGHT)
-        assert result.stop.converged, result.stop
-        costs.append(result.cost_after)
-    assert max(costs) - min(costs) < 1e-6 * min(costs)
-
-
 def test_outliers_are_identified_and_do_not_affect_the_poses(rng):
     window = points_only(seeded_window(8, WindowSize(poses=6, fixed=2, anchors=200, observations=1000)))
     problem = window.problem
@@ -169,20 +134,6 @@ def test_outliers_are_identified_and_do_not_affect_the_poses(rng):
     assert (result.chi2[~bad] > 5.991).mean() < 0.15
 
 
-def test_edges_sharpen_the_poses_and_their_own_depths():
-    window = seeded_window(
-        9, WindowSize(poses=6, fixed=2, anchors=60, observations=200, edges=600, pairs=2400, junctions=0)
-    )
-    both = refine_window(window.problem, TIGHT)
-    points = refine_window(points_only(window).problem, TIGHT)
-    assert pose_error(both, window) < 0.7 * pose_error(points, window)
-    edges = window.problem.edges
-    assert edges is not None
-    before = np.median(np.abs(edges.prior / window.edge_inverse_depth - 1))
-    after = np.median(np.abs(both.edge_inverse_depth / window.edge_inverse_depth - 1))
-    assert after < 0.5 * before
-
-
 def test_covariance_of_the_newest_pose_matches_its_scatter():
     size = WindowSize(poses=4, fixed=2, anchors=60, observations=200, edges=0, junctions=0)
     window = seeded_window(10, size)
@@ -196,44 +147,6 @@ def test_covariance_of_the_newest_pose_matches_its_scatter():
         whitened.append(np.linalg.solve(np.linalg.cholesky(result.pose_covariance), xi))
     # 120 draws: the standard error of a mean of 6 * 120 unit chi-squares is sqrt(2 / 720) = 0.05.
     assert np.square(whitened).mean() == pytest.approx(1.0, abs=0.2)
-
-
-# -- the paper's cycle ----------------------------------------------------------------------------------------
-
-
-def cycle_alone(window: SeededWindow) -> WindowProblem:
-    edges = window.problem.edges
-    assert edges is not None
-    free = replace(
-        edges,
-        pair_inv_sigma=np.zeros(len(edges.pair_edge)),
-        prior_sigma=np.full(len(edges.host), np.inf),
-        cycle_px=True,
-        cycle_sigma=1.0,
-    )
-    return replace(without_points(window.problem), edges=free, junctions=None)
-
-
-def test_the_papers_cycle_alone_shrinks_the_baseline_and_the_full_problem_recovers():
-    size = replace(SMALL, fixed=1, edges=400, pairs=1600)
-    window = seeded_window(11, size)
-    problem = replace(cycle_alone(window), T_c_w=window.T_c_w)
-    alone = refine_window(problem, replace(TIGHT, max_iterations=200, robust=False))
-    true = baselines(window.T_c_w)
-    assert alone.cost_after < 1e-3 * alone.cost_before
-    assert np.median(baselines(alone.T_c_w) / true) < 0.9
-    full = refine_window(replace(window.problem, T_c_w=alone.T_c_w), replace(TIGHT, max_iterations=200))
-    np.testing.assert_allclose(baselines(full.T_c_w), true, rtol=0.05)
-
-
-def test_relative_depth_cycle_does_not_pay_for_shrinking():
-    window = seeded_window(11, replace(SMALL, fixed=1, edges=400, pairs=1600))
-    edges = cycle_alone(window).edges
-    assert edges is not None
-    edges = replace(edges, cycle_px=False, cycle_sigma=0.05)
-    result = refine_window(replace(window.problem, edges=edges), replace(TIGHT, max_iterations=100))
-    ratio = np.median(baselines(result.T_c_w) / baselines(window.T_c_w))
-    assert ratio == pytest.approx(1.0, abs=0.05)
 
 
 # -- gauge and priors -----------------------------------------------------------------------------------------
@@ -285,57 +198,31 @@ def test_a_search_ended_by_the_poses_is_at_the_minimum_within_the_tolerance(seed
 # -- degenerate windows ---------------------------------------------------------------------------------------
 
 
-def world_from(T: np.ndarray, p_w: np.ndarray, fixed: int, rng: np.random.Generator) -> WindowProblem:
-    pose, anchor = np.divmod(np.arange(len(T) * len(p_w)), len(p_w))
-    p_c = np.einsum("nij,nj->ni", T[pose][:, :3, :3], p_w[anchor]) + T[pose][:, :3, 3]
-    uv = pixels(p_c, K) + 0.5 * rng.normal(size=(len(pose), 2))
-    return WindowProblem(
-        T, np.arange(len(T)) < fixed, p_w + 0.05 * rng.normal(size=p_w.shape), pose, anchor, uv, np.ones(len(pose)), K
-    )
+CHANGES = {
+    "all points behind": lambda p: replace(p, p_w=p.p_w * np.array([1, 1, -1.0])),
+    "points on the camera plane": lambda p: replace(p, p_w=p.p_w * np.array([1, 1, 0.0])),
+    "no observations": lambda p: keep(p, np.zeros(len(p.uv), bool)),
+    "nothing free": lambda p: replace(p, pose_fixed=np.ones(len(p.T_c_w), bool)),
+    "every anchor seen once": lambda p: keep(p, p.obs_pose == p.obs_anchor % len(p.T_c_w)),
+    "not finite": lambda p: replace(p, uv=np.where(np.arange(len(p.uv))[:, None] == 3, np.nan, p.uv)),
+}
+NAMES = ["pure rotation", "no motion", "one plane", "one line", "two keyframes", *CHANGES]
 
 
 def degenerate(name: str, rng: np.random.Generator) -> WindowProblem:
     p_w = rng.uniform((-1, -1, 3), (1, 1, 6), (60, 3))
-    T = np.stack([se3.exp(np.array([-0.1 * i, 0, 0, 0, 0.02 * i, 0])) for i in range(4)])
-    if name == "pure rotation":
-        T = np.stack([se3.exp(np.array([0, 0, 0, 0.01 * i, 0.05 * i, 0])) for i in range(4)])
-    if name == "no motion":
-        T = np.stack([np.eye(4)] * 4)
+    step = {"pure rotation": [0, 0, 0, 0.01, 0.05, 0], "no motion": [0.0] * 6}.get(name, [-0.1, 0, 0, 0, 0.02, 0])
+    T = np.stack([se3.exp(np.array(step) * i) for i in range(2 if name == "two keyframes" else 4)])
     if name == "one plane":
         p_w[:, 2] = 4.0
     if name == "one line":
         p_w[:] = p_w[:1] + np.linspace(0, 1, 60)[:, None] * np.array([1.0, 0.5, 0.5])
-    if name == "two keyframes":
-        T = T[:2]
-    problem = world_from(T, p_w, 1, rng)
-    if name == "all points behind":
-        problem = replace(problem, p_w=problem.p_w * np.array([1, 1, -1.0]))
-    if name == "points on the camera plane":
-        problem = replace(problem, p_w=problem.p_w * np.array([1, 1, 0.0]))
-    if name == "no observations":
-        problem = keep(problem, np.zeros(len(problem.uv), bool))
-    if name == "nothing free":
-        problem = replace(problem, pose_fixed=np.ones(len(T), bool))
-    if name == "every anchor seen once":
-        problem = keep(problem, problem.obs_pose == problem.obs_anchor % len(T))
-    if name == "not finite":
-        problem.uv[3] = np.nan
-    return problem
-
-
-NAMES = [
-    "pure rotation",
-    "no motion",
-    "one plane",
-    "one line",
-    "two keyframes",
-    "all points behind",
-    "points on the camera plane",
-    "no observations",
-    "nothing free",
-    "every anchor seen once",
-    "not finite",
-]
+    pose, anchor = np.divmod(np.arange(len(T) * len(p_w)), len(p_w))
+    p_c = np.einsum("nij,nj->ni", T[pose][:, :3, :3], p_w[anchor]) + T[pose][:, :3, 3]
+    uv = pixels(p_c, K) + 0.5 * rng.normal(size=(len(pose), 2))
+    start = p_w + 0.05 * rng.normal(size=p_w.shape)
+    problem = WindowProblem(T, np.arange(len(T)) < 1, start, pose, anchor, uv, np.ones(len(pose)), K)
+    return CHANGES.get(name, lambda p: p)(problem)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -363,18 +250,14 @@ def test_degenerate_window_ends_with_a_reason_and_a_finite_state(name, rng):
         assert result.rank_deficiency >= 1
 
 
-@pytest.mark.parametrize("name", ["pure rotation", "all behind", "one plane", "two keyframes", "nothing free"])
+@pytest.mark.parametrize("name", ["pure rotation", "all behind", "one plane"])
 def test_degenerate_window_with_edges_and_corners_ends_with_a_reason_and_a_finite_state(name):
-    size = replace(SMALL, poses=2, fixed=1) if name == "two keyframes" else SMALL
-    window = seeded_window(22, size)
-    problem = window.problem
+    problem = seeded_window(22, SMALL).problem
     T = problem.T_c_w.copy()
     if name == "pure rotation":
         T[:, :3, 3] = 0.0
     if name == "all behind":
         T[1:] = np.diag([1.0, -1.0, -1.0, 1.0]) @ T[1:]
-    if name == "nothing free":
-        problem = replace(problem, pose_fixed=np.ones(len(T), bool))
     if name == "one plane":
         flat = np.full(len(problem.edges.host), 0.25)
         problem = replace(problem, edges=replace(problem.edges, inverse_depth=flat, prior=flat))
@@ -385,17 +268,6 @@ def test_degenerate_window_with_edges_and_corners_ends_with_a_reason_and_a_finit
     for state in (result.T_c_w, result.p_w, result.edge_inverse_depth, result.junction_inverse_depth):
         assert np.isfinite(state).all()
     assert (result.edge_inverse_depth > 0).all()
-    R = result.T_c_w[:, :3, :3]
-    np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-9)
-
-
-def test_a_window_may_hold_only_edges_or_only_junctions():
-    window = seeded_window(16, SMALL)
-    for left_out in ({"junctions": None}, {"edges": None}):
-        result = refine_window(replace(without_points(window.problem), **left_out), TIGHT)
-        assert result.stop.converged
-        assert np.isfinite(result.T_c_w).all()
-        assert len(result.chi2) == 0
 
 
 @pytest.mark.parametrize(
@@ -415,18 +287,12 @@ def test_misuse_names_the_array(change, message):
         refine_window(replace(problem, **change))
 
 
-def test_results_are_reproducible_to_the_byte():
-    problem = seeded_window(18, SMALL).problem
-    a, b = refine_window(problem), refine_window(problem)
-    assert a.T_c_w.tobytes() == b.T_c_w.tobytes()
-    assert a.p_w.tobytes() == b.p_w.tobytes()
-    assert a.edge_inverse_depth.tobytes() == b.edge_inverse_depth.tobytes()
-
-
-def test_input_arrays_are_unchanged():
+def test_results_are_reproducible_to_the_byte_and_inputs_unchanged():
     problem = seeded_window(19, SMALL).problem
     T, p = problem.T_c_w.copy(), problem.p_w.copy()
-    refine_window(problem)
+    a, b = refine_window(problem), refine_window(problem)
+    for name in ("T_c_w", "p_w", "edge_inverse_depth"):
+        assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
     np.testing.assert_array_equal(problem.T_c_w, T)
     np.testing.assert_array_equal(problem.p_w, p)
 
@@ -434,25 +300,7 @@ def test_input_arrays_are_unchanged():
 def test_gtsam_finds_the_same_minimum():
     pytest.importorskip("gtsam", reason="gtsam is an outside oracle and not installed")
     problem = points_only(seeded_window(20, SMALL)).problem
-    _, cost, T_c_w = refine_with_gtsam(problem, 40)
+    cost, T_c_w = refine_with_gtsam(problem, 40)
     result = refine_window(problem, TIGHT)
     assert result.cost_after == pytest.approx(cost, rel=1e-8)
     np.testing.assert_allclose(result.T_c_w, T_c_w, atol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "size", [WindowSize(fixed=2), WindowSize(25, 15, 2000, 12_800), WindowSize(60, 2, 4000, 25_000)]
-)
-def test_a_step_takes_at_most_a_quarter_of_gtsams_time(size):
-    pytest.importorskip("gtsam", reason="gtsam is an outside oracle and not installed")
-    problem, steps = points_only(seeded_window(0, size)).problem, 4
-    config = LmConfig(max_iterations=steps, cost_tolerance=0.0, diagnostics=False)
-    refine_window(problem, config)  # compiles
-    ours, theirs = [], []
-    for _ in range(3):
-        start = time.process_time()
-        assert refine_window(problem, config).iterations == steps
-        ours.append(time.process_time() - start)
-        theirs.append(refine_with_gtsam(problem, steps)[0])
-    assert min(ours) <= 0.25 * min(theirs)

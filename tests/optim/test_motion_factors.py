@@ -2,14 +2,10 @@
 
 import numpy as np
 import pytest
-from numeric import derivative
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.optim.motion_factors import (
     MotionTerms,
-    gravity_jacobian,
-    gravity_residual,
-    heading_jacobian,
     heading_residual,
 )
 from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
@@ -81,25 +77,6 @@ def test_curvature_of_centres_is_exact_in_the_translations(rng, terms):
     np.testing.assert_allclose(moved_g - g, H[:, 12:18] @ xi, rtol=1e-9, atol=1e-9)
 
 
-def test_gravity_jacobian_matches_finite_differences(rng):
-    T = random_poses(rng, 1)
-    factor = GravityFactor(np.array([0]), np.array([[0.0, -1.0, 0.0]]), np.array([0.0, 0.0, 1.0]), 0.2)
-    numeric = derivative(lambda turn: gravity_residual(moved_by(T, 0, np.r_[0, 0, 0, turn]), factor)[0], 3)
-    np.testing.assert_allclose(gravity_jacobian(T, factor)[0], numeric, atol=1e-7)
-
-
-def test_heading_jacobian_matches_finite_differences(rng):
-    T = random_poses(rng, 3)
-    up = np.array([0.48, 0.6, 0.64])
-    factor = HeadingFactor(np.arange(3), random_poses(rng, 3)[:, :3, :3], up, np.eye(3))
-    J = heading_jacobian(T, factor)
-    for pose in range(3):
-        numeric = derivative(
-            lambda turn, pose=pose: heading_residual(moved_by(T, pose, np.r_[0, 0, 0, turn]), factor)[pose], 3
-        )
-        np.testing.assert_allclose(J[pose], numeric, atol=1e-7)
-
-
 def test_a_heading_is_a_rotation_about_the_vertical_only(rng):
     T = random_poses(rng, 2)
     up = np.array([0.0, 0.0, 1.0])
@@ -127,10 +104,3 @@ def test_gravity_has_a_direction():
     for up_c, expected in (([0.0, -1.0, 0.0], 0.0), ([0.0, 1.0, 0.0], 400.0)):
         factor = GravityFactor(np.array([0]), np.array([up_c]), np.array([0.0, 0.0, 1.0]), 0.1)
         assert cost(MotionTerms((), (factor,), (), np.arange(1)), T) == pytest.approx(expected, abs=1e-9)
-
-
-def test_no_factors_have_no_cost_and_no_effect(rng):
-    T = random_poses(rng, 2)
-    H, g = np.zeros((12, 12)), np.zeros(12)
-    assert MotionTerms((), (), (), np.arange(2)).linearise(T, H, g) == 0.0
-    assert not H.any() and not g.any()

@@ -3,7 +3,7 @@ import pytest
 from numeric import derivative
 
 from edgeslam_torch.geometry import se3, sim3
-from edgeslam_torch.optim.pose_graph import PoseGraph, adjoint, jacobians, residuals, solve
+from edgeslam_torch.optim.pose_graph import PoseGraph, jacobians, residuals, solve
 
 COUNT = 60
 STEP = 2 * np.pi / COUNT
@@ -59,34 +59,6 @@ def test_true_edges_recover_a_drifted_ring():
     np.testing.assert_allclose(solve(graph_of(start, i, j, S_ij)), true, atol=1e-6)
 
 
-def test_drift_of_scale_rotation_and_translation_is_distributed():
-    true = ring()
-    i, j, _, wrong = drifted(true, np.array([0.0, 0.0, 0.01, 0.0, 0.002, 0.0, 0.005]))
-    start = composed(true[0], wrong)
-    i, j = np.append(i, COUNT - 1), np.append(j, 0)
-    S_ij = np.concatenate([wrong, [relative(true, COUNT - 1, 0)]])
-    weight = np.ones((len(i), 7))
-    weight[-1] = 100.0
-    solved = solve(graph_of(start, i, j, S_ij, weight))
-
-    def errors(S):
-        centres = [np.linalg.inv(one)[:3, 3] for one in S]
-        return np.linalg.norm(np.array(centres) - [np.linalg.inv(one)[:3, 3] for one in true], axis=1)
-
-    assert errors(start).max() > 1.4
-    assert errors(solved)[-1] < 0.01
-    # What is left is the bend that no loop can tell from the truth; it is far below the drift.
-    assert errors(solved).max() < 0.25 * errors(start).max()
-    scales = np.log([sim3.scale_of(S) for S in solved])
-    assert np.abs(scales).max() < 0.5 * np.log(sim3.scale_of(start[-1]))
-
-
-def test_a_consistent_graph_is_unchanged():
-    true = ring()
-    graph = graph_of(true, *chain(true))
-    np.testing.assert_allclose(solve(graph), true, atol=1e-12)
-
-
 def test_a_weaker_edge_takes_more_of_the_correction():
     """Three nodes on a line and a way back that is one unit too short: a sigma twice as large takes four times more."""
     S = np.tile(np.eye(4), (3, 1, 1))
@@ -100,13 +72,6 @@ def test_a_weaker_edge_takes_more_of_the_correction():
     weight[:, 6] = 1e6  # the scale takes no part
     solved = solve(graph_of(S, np.append(i, 2), np.append(j, 0), np.concatenate([S_ij, [back]]), weight))
     np.testing.assert_allclose(solved[:, 2, 3], [0.0, -0.8, -1.0], atol=1e-6)
-
-
-def test_the_gauge_is_fixed():
-    true = ring()
-    i, j, _, wrong = drifted(true, np.array([0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.01]))
-    graph = graph_of(true, i, j, wrong)
-    np.testing.assert_array_equal(solve(graph)[0], true[0])
 
 
 def test_jacobians_match_numeric_derivatives(rng):
@@ -126,12 +91,6 @@ def test_jacobians_match_numeric_derivatives(rng):
         for edge, node in enumerate(nodes):
             numeric = derivative(lambda d, node=node: with_moved(node, d), 7)
             np.testing.assert_allclose(J[edge], numeric[edge], atol=2e-6)
-
-
-def test_adjoint_moves_a_tangent_from_one_side_to_the_other(rng):
-    for _ in range(5):
-        S, xi = sim3.exp(rng.normal(0.0, 0.7, 7)), rng.normal(0.0, 0.5, 7)
-        np.testing.assert_allclose(S @ sim3.exp(xi) @ sim3.inverse(S), sim3.exp(adjoint(S[None])[0] @ xi), atol=1e-12)
 
 
 @pytest.mark.parametrize("nodes", [2, 300])

@@ -60,16 +60,6 @@ def test_covariance_matches_the_scatter():
     assert np.square(whitened).mean() == pytest.approx(1.0, abs=0.2)  # standard error 0.06
 
 
-def test_octave_sigma_weighs(rng):
-    T, p, uv = view(rng, 200)
-    coarse = np.arange(200) < 100
-    uv = uv + coarse[:, None] * 4.0 * rng.normal(size=(200, 2)) + 0.3 * rng.normal(size=(200, 2))
-    told = refine_pose(away(T, rng), p, uv, np.where(coarse, 1 / 4.0, 1 / 0.3), K)
-    untold = refine_pose(away(T, rng), p, uv, np.full(200, 1 / 4.0), K)
-    assert error(told.T_c_w, T) < error(untold.T_c_w, T)
-    assert told.inliers[coarse].mean() > 0.85
-
-
 def test_prior_pulls_by_its_information(rng):
     T, p, uv = view(rng, 50, 1.0)
     elsewhere = away(T, rng, 0.01)

@@ -25,14 +25,12 @@ class Job(Future):
         self._work = work
 
     def run(self):
-        """Do it now, in the caller's thread."""
         try:
             self.set_result(self._work())
         except BaseException as error:
             self.set_exception(error)
 
     def result(self, timeout=None):
-        """What came out."""
         if not self.done():
             self.run()
         return super().result(timeout)
@@ -42,31 +40,24 @@ class Scheduler(Executor):
     """Keeps what is submitted until `work`; with ``at_once`` it is done when it is submitted."""
 
     def __init__(self, at_once=False):
-        self.at_once = at_once
-        self.jobs = []
-        self.is_shut = False
+        self.at_once, self.jobs, self.is_shut = at_once, [], False
 
     def submit(self, fn, /, *args, **kwargs):
-        """Keep a call for later."""
         assert not self.is_shut
-        job = Job(lambda: fn(*args, **kwargs))
-        self.jobs.append(job)
+        self.jobs.append(Job(lambda: fn(*args, **kwargs)))
         if self.at_once:
-            job.run()
-        return job
+            self.work()
+        return self.jobs[-1]
 
     @property
     def waiting(self):
-        """What is not done yet."""
         return [job for job in self.jobs if not job.done()]
 
     def work(self):
-        """Do all that waits."""
         for job in self.waiting:
             job.run()
 
     def shutdown(self, wait=True, *, cancel_futures=False):
-        """No more work."""
         self.is_shut = True
 
 

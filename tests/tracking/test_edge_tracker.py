@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from point_map import small_motion
+from point_map import edge_points, small_motion
 from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.config import EdgeConfig, OrbConfig
@@ -12,7 +12,7 @@ from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.edges.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.tracking.edge_tracker import EdgeImage, EdgeTracker, PointsInFrame
 
@@ -29,18 +29,8 @@ def tracker_on(image, depth_m, T_w_c):
     found = extract_edges(grey, 40.0, 100.0, 4000)
     u, v = found.uv.astype(int).T
     z = cv2.erode(depth_m, np.ones((5, 5)))[v, u].astype(np.float64)  # an outline belongs to what is nearer
-    count = len(z)
-    edges.hosts.append(
-        EdgePoints(
-            0,
-            found.uv,
-            found.normal,
-            CAMERA.back_project(found.uv, z),
-            np.full(count, 0.01),
-            np.zeros((count, 3), np.uint8),
-            np.full(count, 2, np.int32),
-        )
-    )
+    own = {"uv": found.uv, "normal": found.normal, "observations": np.full(len(z), 2, np.int32)}
+    edges.hosts.append(edge_points(0, CAMERA.back_project(found.uv, z), CAMERA, **own))
     return EdgeTracker(slam_map, edges, CAMERA)
 
 
@@ -73,11 +63,6 @@ def test_edges_alone_find_the_pose(flight, tracker, rng, index):
     assert turn < 0.2
     assert pose.is_fixed
     assert pose.edges > 300
-
-
-def test_disabled_tracking_uses_no_edges(flight, tracker):
-    off = EdgeTracker(tracker.map, tracker.edges, tracker.camera, enabled=False)
-    assert off.refine(grey_of(flight, 1), se3.inverse(flight.T_w_c[1])) is None
 
 
 def test_a_wrong_pose_from_a_distant_prediction_is_rejected(flight, tracker, rng):
@@ -115,13 +100,6 @@ def test_a_prediction_is_no_measurement():
     pose = tracker_on(STRIPES, np.full((240, 320), 2.0), np.eye(4)).refine(STRIPES, np.eye(4), None, expected)
     assert pose.edges > 500
     assert not pose.is_fixed
-
-
-def test_the_covariance_is_that_of_the_edges(flight, tracker):
-    T_c_w = se3.inverse(flight.T_w_c[1])
-    expected = PosePrior(0, T_c_w, np.diag([0.005**-2.0] * 3 + [0.002**-2.0] * 3))
-    alone, both = (tracker.refine(grey_of(flight, 1), T_c_w, None, prior) for prior in (None, expected))
-    np.testing.assert_allclose(np.diag(both.covariance), np.diag(alone.covariance), rtol=0.2)
 
 
 def test_an_image_of_another_place_is_rejected(tracker, flight, rng):

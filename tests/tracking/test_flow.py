@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from point_map import add_anchors
 from rendered import CAMERA, sideways, stairs_world
 
 from edgeslam_torch.config import FlowConfig, MappingConfig, OrbConfig
@@ -16,9 +17,7 @@ from edgeslam_torch.map.keyframe import NO_ANCHOR, make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.tracking.flow import (
-    LEVELS,
     MIN_SHARE,
-    NEAR_LEVELS,
     FlowTracker,
     join,
     template_of_keyframe,
@@ -45,8 +44,7 @@ class Scene:
         self.keyframe = make_keyframe(0, 0, 0.0, se3.inverse(POSES[0]), features)
         column, row = np.rint(features.uv).astype(int).T
         p_c = CAMERA.back_project(features.uv, seen.depth_m[row, column])
-        colour = np.zeros((len(p_c), 3), np.uint8)
-        ids = self.map.anchors.add(se3.transform(POSES[0], p_c), self.keyframe.words, 0, False, colour)
+        ids = add_anchors(self.map, se3.transform(POSES[0], p_c), self.keyframe.words)
         self.map.add_keyframe(self.keyframe)
         self.map.observe(self.keyframe, np.arange(len(ids)), ids)
         self.template = template_of_keyframe(self.keyframe, self.grey)
@@ -81,25 +79,6 @@ def test_pose_is_accurate_to_half_a_pixel_from_a_prediction_error_of_ten(scene, 
     assert (np.sqrt(np.diag(followed.track.covariance)) < 0.02).all()
 
 
-def test_flow_is_accurate_to_half_a_pixel(scene):
-    """Rendered truth of every point against where flow puts it; corners at panel borders hide things, hence 80 %."""
-    tracker = scene.tracker()
-    keypoint = scene.keyframe.keypoints_with_anchor()
-    expected = CAMERA.project(se3.transform(se3.inverse(POSES[1]), scene.map.anchors.p_w[scene.keyframe.anchor]))
-    uv, found = tracker._flow(scene.template, grey_at(POSES[1]), keypoint, expected + 3.0, levels=2)
-    off = np.linalg.norm(uv - expected, axis=1)[found]
-    assert np.quantile(off, 0.8) < 0.5
-    assert found.mean() > 0.8
-
-
-def test_the_number_of_tracked_keypoints_is_limited_and_they_are_spread(scene):
-    tracker = scene.tracker(points=60)
-    track = tracker.follow(scene.template, scene.grey, scene.keyframe.T_c_w).track
-    assert track.matches <= 60
-    uv = scene.keyframe.features.uv[track.matched_keypoint]
-    assert len({(int(u // 80), int(v // 80)) for u, v in uv}) >= 11  # cells of a 4 x 3 grid
-
-
 def test_keypoints_out_of_view_count_against_the_share(scene, monkeypatch):
     """Turned until a part has left the image: what is left tells the pose, and the share that it is less."""
     turned = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, 0.3, 0]))
@@ -114,15 +93,6 @@ def test_keypoints_out_of_view_count_against_the_share(scene, monkeypatch):
     assert lost_most(replace(followed, share=0.6))
 
 
-def test_a_pose_uses_the_keypoints_in_view(scene):
-    """A third of the template is left, and nearly all of that is found: no reason to be lost."""
-    turned = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, 0.75, 0]))
-    followed = scene.tracker().follow(scene.template, grey_at(turned), se3.inverse(turned))
-    assert followed.share < MIN_SHARE
-    assert followed.trusted
-    assert error(followed.track.T_c_w, turned)[0] < 0.02
-
-
 def test_few_inliers_in_view_give_a_prediction_but_no_pose(scene):
     """Most of the image is blurred: what is left agrees, and is no evidence about the other anchors."""
     grey = scene.grey.copy()
@@ -134,22 +104,6 @@ def test_few_inliers_in_view_give_a_prediction_but_no_pose(scene):
     assert followed.share < MIN_SHARE
     assert error(followed.track.T_c_w, POSES[0])[0] < 0.05
     np.testing.assert_array_equal(scene.map.anchors.visible, before)
-
-
-def test_all_pyramid_levels_are_used_only_if_they_find_more(scene, monkeypatch):
-    """Coarse levels lose keypoints near the border of the image."""
-    tracker, tried = scene.tracker(), []
-    found = FlowTracker._locate
-
-    def locate(self, template, grey, keypoint, guess, T_c_w, levels, expected):
-        tried.append(levels)
-        some = keypoint[: len(keypoint) // (2 if levels == NEAR_LEVELS else 4)]
-        return found(self, template, grey, some, guess[: len(some)], T_c_w, levels, expected)
-
-    monkeypatch.setattr(FlowTracker, "_locate", locate)
-    followed = tracker.follow(scene.template, scene.grey, scene.keyframe.T_c_w)
-    assert tried == [NEAR_LEVELS, LEVELS]
-    assert 0.4 < followed.share < 0.55
 
 
 @pytest.mark.parametrize("what", ["black", "noise", "elsewhere", "behind"])
@@ -212,29 +166,6 @@ def test_a_matched_frame_can_be_followed_without_being_a_keyframe(scene):
     assert error(followed.track.T_c_w, POSES[1])[0] < 0.01
 
 
-def test_anchors_found_by_flow_only_are_assigned_to_free_keypoints(scene):
-    """Of a frame's keypoints every second is matched; flow gives the others to the corners under it."""
-    grey = grey_at(POSES[1])
-    view = make_view(OrbExtractor(ORB, CAMERA)(grey), ORB.scale_factor)
-    followed = scene.tracker(points=1000).follow(scene.template, grey, se3.inverse(POSES[1]))
-    nothing = np.zeros(0, dtype=np.int64)
-    T_c_w = followed.track.T_c_w
-    alone = join(Track(T_c_w, nothing, nothing, nothing, nothing, np.eye(6)), followed, view, ORB.scale_factor)
-    assert alone.inliers == alone.matches > 100
-    assert len(np.unique(alone.keypoint)) == len(np.unique(alone.anchor)) == alone.inliers
-    expected = CAMERA.project(se3.transform(se3.inverse(POSES[1]), scene.map.anchors.p_w[alone.anchor]))
-    off = np.linalg.norm(view.features.uv[alone.keypoint] - expected, axis=1)
-    assert (off < 3.0 * 1.2 ** view.features.octave[alone.keypoint]).mean() > 0.9
-
-    some = Track(T_c_w, alone.keypoint[::2], alone.anchor[::2], alone.keypoint[::2], alone.anchor[::2], np.eye(6))
-    joined = join(some, followed, view, ORB.scale_factor)
-    np.testing.assert_array_equal(joined.keypoint[: some.inliers], some.keypoint)  # what matched stays
-    pairs = [set(zip(t.keypoint.tolist(), t.anchor.tolist(), strict=True)) for t in (alone, joined)]
-    # Two anchors may vie for one corner, and what is matched already takes part no more.
-    assert len(pairs[0] & pairs[1]) > 0.95 * alone.inliers
-    assert len(np.unique(joined.keypoint)) == len(np.unique(joined.anchor)) == joined.inliers
-
-
 def test_pixels_of_flow_become_keypoints_with_their_anchors_descriptors(scene):
     grey = grey_at(POSES[1])
     followed = scene.tracker().follow(scene.template, grey, se3.inverse(POSES[1]))
@@ -247,15 +178,6 @@ def test_pixels_of_flow_become_keypoints_with_their_anchors_descriptors(scene):
     np.testing.assert_array_equal(features.octave[track.keypoint], followed.octave)
     np.testing.assert_array_equal(words(features.descriptors)[track.keypoint], scene.map.anchors.words[track.anchor])
     np.testing.assert_array_equal(track.anchor, followed.track.anchor)
-
-
-def test_a_frame_whose_keypoints_are_all_matched_gains_nothing(scene):
-    view = make_view(scene.keyframe.features, ORB.scale_factor)
-    followed = scene.tracker().follow(scene.template, scene.grey, scene.keyframe.T_c_w)
-    everything = np.arange(len(view.features.uv))
-    anchor = scene.keyframe.anchor
-    full = Track(scene.keyframe.T_c_w, everything, anchor, everything, anchor, np.eye(6))
-    assert join(full, followed, view, ORB.scale_factor) is full
 
 
 # -- when a keyframe is due -----------------------------------------------------------------------------------------
@@ -293,7 +215,7 @@ def test_keypoints_are_selected_again_when_the_map_changes(scene):
     assert not np.isin(before[:50], after).any()
     free = np.flatnonzero(scene.keyframe.anchor == NO_ANCHOR)[:50]
     p_w = scene.map.anchors.p_w[before[:50]]  # a removed anchor's row still says where it was
-    ids = scene.map.anchors.add(p_w, scene.keyframe.words[free], 0, False, np.zeros((50, 3), np.uint8))
+    ids = add_anchors(scene.map, p_w, scene.keyframe.words[free])
     scene.map.observe(scene.keyframe, free, ids)
     assert np.isin(ids, tracker.follow(scene.template, scene.grey, at).track.matched_anchor).sum() > 40
 

@@ -1,11 +1,9 @@
 """Focal length of an unknown camera."""
 
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 import pytest
-from point_world import box_room
 from rendered import film, stairs_world
 
 from edgeslam_torch.geometry import se3
@@ -16,8 +14,6 @@ from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.self_calibration import (
     FocalEstimate,
     _map_problem,
-    _refined_with,
-    _slope,
     calibration_warning,
     contradicts,
     focal_from_map,
@@ -134,49 +130,29 @@ def test_no_pairs_give_no_estimate():
     assert focal_from_matches([], WIDTH, HEIGHT) == FocalEstimate(None, np.inf, 0, "0 of 0 image pairs usable")
 
 
-def test_room_without_noise(rng):
-    world = box_room(rng, 400, n_views=6)
-    views = [(i, j) for i in range(6) for j in range(i + 1, min(i + 3, 6))]
-    both = [(world.uv[i, v], world.uv[j, v]) for i, j in views for v in [world.visible[i] & world.visible[j]]]
-    assert focal_from_matches(both, 640, 480).focal_px == pytest.approx(320.0, rel=0.02)
-
-
-@lru_cache(maxsize=1)
-def strolling():
-    """20 images of panels at many depths, 320x240, focal length 300 px."""
-    rng = np.random.default_rng(4)
-    camera = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
-    steps = np.cumsum(rng.normal(0.0, 1.0, (20, 6)) * [0.09, 0.07, 0.03, 0.02, 0.03, 0.03], axis=0)
-    steps -= steps.mean(0)
-    return film(stairs_world(), camera, np.stack([se3.exp(xi) for xi in steps]))
+@pytest.mark.parametrize(
+    ("count", "words"), [(0, "image pairs usable"), (1, "image pairs usable"), (12, "too few matches")]
+)
+def test_too_few_or_black_images_fall_back_with_a_reason(count, words):
+    camera = guess_camera([np.zeros((240, 320), np.uint8)] * count, 320, 240)
+    assert camera.fx == 384.0
+    assert camera.source.startswith("guess: 1.2*max(w,h) = 384 px (") and words in camera.source
+    assert camera.focal_sigma == GUESSED_FOCAL_SIGMA
 
 
 @pytest.mark.slow
-def test_rendered_flight_gives_it_within_fifteen_percent():
+def test_a_rendered_flight_gives_it_within_fifteen_percent():
     """ORB's pixel of noise weighs twice at this size; the guess in its place is off by 28 %."""
-    images = [f.image for f in strolling().frames]
+    lens = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
+    rng = np.random.default_rng(4)
+    steps = np.cumsum(rng.normal(0.0, 1.0, (20, 6)) * [0.09, 0.07, 0.03, 0.02, 0.03, 0.03], axis=0)
+    steps -= steps.mean(0)
+    images = [f.image for f in film(stairs_world(), lens, np.stack([se3.exp(xi) for xi in steps])).frames]
     camera = guess_camera(images, 320, 240)
     assert camera.fx == camera.fy == pytest.approx(300.0, rel=0.15)
     assert (camera.cx, camera.cy) == (159.5, 119.5)
-    assert camera.source.startswith(f"focal from the fundamental matrix: {camera.fx:.0f} +- ")
-    assert camera.source.endswith(" pairs")
+    assert camera.source.startswith("focal from the fundamental matrix")
     assert 0.02 <= camera.focal_sigma <= 0.15
-    assert guess_camera(images, 320, 240) == camera
-
-
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_too_few_images_fall_back_with_a_reason(count):
-    camera = guess_camera([f.image for f in strolling().frames[:count]], 320, 240)
-    assert camera.fx == 384.0
-    assert camera.source.startswith("guess: 1.2*max(w,h) = 384 px (")
-    assert "image pairs usable" in camera.source
-
-
-def test_black_images_fall_back():
-    camera = guess_camera([np.zeros((240, 320), np.uint8)] * 12, 320, 240)
-    assert camera.fx == 384.0
-    assert "too few matches" in camera.source
-    assert camera.focal_sigma == GUESSED_FOCAL_SIGMA
 
 
 TRUE_LENS = Camera(WIDTH, HEIGHT, 500.0, 510.0, 310.0, 250.0)
@@ -237,22 +213,6 @@ def test_a_refined_map_gives_the_focal_length_and_its_sigma(factor):
     assert contradicts(estimate, camera) is (factor != 1.0)
 
 
-def test_the_slope_of_a_refined_map_is_that_of_its_least_cost():
-    """Poses short of their minimum add their own slope, from which Newton's method does not recover."""
-    keyframes = walked_keyframes(np.random.default_rng(3), 24)
-    camera = another_lens(0.7)
-    problem = _map_problem(camera, keyframes, cloud(np.random.default_rng(3)))
-    near = _refined_with(problem, camera, 0.085)
-    here = _refined_with(replace(problem, T_c_w=near.T_c_w, p_w=near.p_w), camera, 0.1)
-    slope = _slope(replace(problem, T_c_w=here.T_c_w, p_w=here.p_w), camera, 0.1)
-
-    def least(log_scale):
-        K = tuple(k * s for k, s in zip(problem.K, [np.exp(log_scale)] * 2 + [1.0, 1.0], strict=True))
-        return refine_window(replace(problem, K=K), LmConfig(max_iterations=200, cost_tolerance=1e-12)).cost_after
-
-    assert slope == pytest.approx((least(0.11) - least(0.09)) / 0.02, rel=0.05)
-
-
 def test_a_guessed_focal_length_is_not_contradicted(rng):
     assert calibration_warning(another_lens(1.3, focal_sigma=GUESSED_FOCAL_SIGMA), walked_keyframes(rng)) is None
 
@@ -275,21 +235,3 @@ def test_without_motion_there_is_no_warning(rng, count):
 )
 def test_only_a_significant_large_difference_is_a_contradiction(focal, sigma, pairs, is_doubted):
     assert contradicts(FocalEstimate(focal, sigma, pairs, ""), TRUE_LENS) is is_doubted
-
-
-@pytest.mark.slow
-@pytest.mark.data
-@pytest.mark.parametrize("factor", [0.7, 1.0, 1.3])
-@pytest.mark.parametrize("name", ["7scenes_redkitchen", "tum_fr1_xyz"])
-def test_a_recording_with_the_calibration_of_another_lens(data_dir, name, factor):
-    """Measured on the first 250 frames of redkitchen: 0.7 times bends the trajectory from 3 cm to 17."""
-    from edgeslam_torch.readers.source import open_source
-    from edgeslam_torch.slam import EdgeSlam
-
-    source = open_source(data_dir / name, max_frames=400)
-    camera = replace(source.camera, fx=factor * source.camera.fx, fy=factor * source.camera.fy)
-    slam = EdgeSlam(camera)
-    for frame in source.frames():
-        slam.step(frame)
-    slam.finish()
-    assert any("contradict the calibration" in w for w in slam.warnings()) == (factor != 1.0)

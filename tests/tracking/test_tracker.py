@@ -107,14 +107,6 @@ def test_anchors_behind_outside_or_seen_from_behind_are_not_expected(points):
     assert nothing.uv.shape == (0, 2)
 
 
-def test_median_parallax_worked_by_hand():
-    p_w = np.array([[0.0, 0.0, 2.0]] * 3)
-    T_c_w = np.eye(4)
-    T_c_w[0, 3] = -2.0  # camera 2 m to the right
-    assert median_parallax(p_w, T_c_w, np.zeros(3)) == pytest.approx(np.pi / 4)
-    assert median_parallax(p_w[:0], T_c_w, np.zeros(3)) == 0.0
-
-
 def test_median_parallax_counts_from_where_the_camera_is():
     """A point 1 m right and 2 m ahead: straight ahead of a camera 1 m right, not of one 1 m left."""
     p_w = np.array([[1.0, 0.0, 2.0]] * 3)

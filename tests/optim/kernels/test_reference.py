@@ -1,211 +1,99 @@
 """The solver against dense normal equations: cost, gradient and step of whole windows."""
 
-import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-import torch
 from seeded_window import WindowSize, seeded_window
-from torch import Tensor
 
-from edgeslam_torch.geometry import se3, se3_torch
-from edgeslam_torch.losses.robust import Kernel, rho
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.optim import modules
 from edgeslam_torch.optim.blocks import Anchors
+from edgeslam_torch.optim.kernels.edges import PIXEL, RELATIVE_DEPTH
 from edgeslam_torch.optim.problem import DepthPriors, LmConfig, WindowProblem
-from edgeslam_torch.optim.window import State, System, Window
+from edgeslam_torch.optim.window import Window
+from edgeslam_torch.types import FloatArray
 
-
-class Unknowns(NamedTuple):
-    """Steps away from a window's start."""
-
-    poses: Tensor
-    """``(F, 6)`` left tangents of the free poses."""
-    anchors: Tensor
-    """``(A, 3)``."""
-    edges: Tensor
-    """``(E,)`` inverse depths."""
-    junctions: Tensor
-    """``(C, 3)`` inverse depths."""
+UNBOUNDED = 1e18
+"""Of a term without a robust kernel."""
 
 
 class Dense(NamedTuple):
-    """Everything at the start of a window."""
+    """Everything at the start of a window; unknowns are free poses, anchors, edges and junctions in this order."""
 
-    cost: Tensor
-    H: Tensor
-    """``(N, N)``: poses, anchors, edges, junctions, each as `Unknowns` has it."""
-    g: Tensor
+    cost: float
+    H: FloatArray
+    """``(N, N)``."""
+    g: FloatArray
     """``(N,)``."""
-    split: tuple[int, int, int, int]
-    """Numbers of unknowns."""
-
-
-Term = tuple[Callable[[Unknowns], Tensor], float | None]
-"""Whitened residuals ``(n, k)`` whose square over ``k`` goes through a kernel of this width; None for none."""
+    poses: int
+    """Number of the poses' unknowns."""
 
 
 def dense(problem, config):
-    """Cost and normal equations of a window, without pose priors; all points must lie in front."""
-    zero = _zero(problem)
-    size = sum(x.numel() for x in zero)
-    cost, H, g = torch.zeros((), dtype=torch.float64), torch.zeros(size, size).double(), torch.zeros(size).double()
-    for residual, delta in _terms(problem, config):
-        r = residual(zero)
-        by = torch.func.jacfwd(residual, 0)(zero)
-        J = torch.cat([d.reshape(*r.shape, -1) for d in by], 2)
-        value, weight = (r.square().sum(1), torch.ones(len(r)).double())
-        if delta is not None and math.isfinite(delta):
-            value, weight = rho(value, Kernel.HUBER, delta)
-        cost = cost + value.sum()
-        H += torch.einsum("n,nki,nkj->ij", weight, J, J)
-        g += torch.einsum("n,nki,nk->i", weight, J, r)
-    a, b, c, d = (x.numel() for x in zero)
-    return Dense(cost, H, g, (a, b, c, d))
+    """Cost and normal equations of a window, without pose priors, by the loss modules' rows."""
+    free, T, K = ~np.asarray(problem.pose_fixed), problem.T_c_w, problem.K
+    pose = np.where(free, 6 * (np.cumsum(free) - 1), -1)
+    anchors = 6 * int(free.sum())
+    edges = anchors + 3 * len(problem.p_w)
+    junctions = edges + (0 if problem.edges is None else len(problem.edges.host))
+    size = junctions + (0 if problem.junctions is None else 3 * len(problem.junctions.host))
+    cost, H, g = 0.0, np.zeros((size, size)), np.zeros(size)
+
+    def add(r, chi2_95, *parts):
+        """Residuals ``(n, k)`` that share Huber's kernel, and derivatives ``(n, k, m)`` from columns ``(n,)`` on."""
+        nonlocal cost
+        norm, delta = np.linalg.norm(r, axis=1), chi2_95**0.5 if config.robust else UNBOUNDED
+        cost += np.where(norm > delta, 2.0 * delta * norm - delta**2, norm**2).sum()
+        J = np.zeros((*r.shape, size))
+        for by, column in parts:
+            for i in np.flatnonzero(column >= 0):
+                J[i, :, column[i] : column[i] + by.shape[2]] += by[i]
+        weight = delta / np.maximum(norm, delta)
+        H[:] += np.einsum("n,nki,nkj->ij", weight, J, J)
+        g[:] += np.einsum("n,nki,nk->i", weight, J, r)
+
+    def add_pairs(kind, block, host, target, column, *arguments):
+        """Each row of a pair under a kernel of its own; it depends on two poses by the motion between them."""
+        motion = T[target] @ se3.inverse(T[host])
+        r, J, _ = getattr(modules, kind)(motion, np.arange(len(host)), block, *arguments, K)
+        by_host = -J[..., :6] @ np.stack([se3.adjoint(one) for one in motion])
+        for k in range(r.shape[1]):
+            row = slice(k, k + 1)
+            own = (J[:, row, :6], pose[target]), (by_host[:, row], pose[host]), (J[:, row, 6:], column)
+            add(r[:, row], 3.841, *own)
+
+    seen, anchor = problem.obs_pose, problem.obs_anchor
+    r, J, _ = modules.reprojection(T, problem.p_w, seen, anchor, problem.uv, problem.inv_sigma, K)
+    add(r, 5.991, (J[..., :6], pose[seen]), (J[..., 6:], anchors + 3 * anchor))
+    if (known := problem.depth_priors) is not None:
+        told = known.inverse_depth, 1.0 / known.sigma
+        r, J, _ = modules.inverse_depth(T, problem.p_w, known.pose, known.anchor, *told)
+        add(r, 5.991, (J[..., :6], pose[known.pose]), (J[..., 6:], anchors + 3 * known.anchor))
+    if (e := problem.edges) is not None:
+        seen = e.uv, e.inverse_depth, e.pair_uv, e.pair_normal, e.pair_inv_sigma, e.pair_inverse_depth
+        cycle, which = (PIXEL if e.cycle_px else RELATIVE_DEPTH, 1.0 / e.cycle_sigma), e.pair_edge
+        add_pairs("edges", which, np.asarray(e.host)[which], e.pair_pose, edges + which, *seen, *cycle)
+        weight, own = 1.0 / np.asarray(e.prior_sigma), edges + np.arange(len(e.host))
+        add(((e.inverse_depth - e.prior) * weight)[:, None], UNBOUNDED, (weight[:, None, None], own))
+    if (c := problem.junctions) is not None:
+        seen = c.uv, c.inverse_depth, c.pair_uv, c.pair_arms, c.inv_sigma_px, c.inv_sigma_angle, c.cosines
+        which = c.pair_junction
+        add_pairs("junctions", which, np.asarray(c.host)[which], c.pair_pose, junctions + 3 * which, *seen)
+        root = np.swapaxes(np.linalg.cholesky(c.prior_information), 1, 2)
+        off = (root @ (c.inverse_depth - c.prior)[..., None])[..., 0]
+        add(off, UNBOUNDED, (root, junctions + 3 * np.arange(len(c.host))))
+    return Dense(cost, H, g, anchors)
 
 
 def dense_step(system, mu):
     """The damped step ``(N,)``, unknowns that nothing observes left alone."""
-    damped = system.H + mu * torch.diag(system.H.diagonal())
-    seen = system.H.diagonal() > 0
-    out = torch.zeros_like(system.g)
-    out[seen] = -torch.linalg.solve(damped[seen][:, seen], system.g[seen])
+    damped = system.H + mu * np.diag(np.diag(system.H))
+    seen = np.diag(system.H) > 0
+    out = np.zeros_like(system.g)
+    out[seen] = -np.linalg.solve(damped[np.ix_(seen, seen)], system.g[seen])
     return out
-
-
-def _zero(problem):
-    edges = 0 if problem.edges is None else len(problem.edges.host)
-    junctions = 0 if problem.junctions is None else len(problem.junctions.host)
-    free = int((~np.asarray(problem.pose_fixed)).sum())
-    shapes = (free, 6), (len(problem.p_w), 3), (edges,), (junctions, 3)
-    return Unknowns(*(torch.zeros(shape, dtype=torch.float64) for shape in shapes))
-
-
-def _terms(problem, config):
-    fx, fy, cx, cy = problem.K
-    focal, centre = _t([fx, fy]), _t([cx, cy])
-    start, free = _t(problem.T_c_w), torch.as_tensor(~np.asarray(problem.pose_fixed))
-
-    def poses(u):
-        return start.index_put((free.nonzero()[:, 0],), se3_torch.exp(u.poses) @ start[free])
-
-    def in_camera(T, p):
-        return (T[:, :3, :3] @ p[..., None])[..., 0] + T[:, :3, 3]
-
-    def pixel(p_c):
-        return p_c[..., :2] / p_c[..., 2:] * focal + centre
-
-    def anchors(u):
-        p_c = in_camera(poses(u)[problem.obs_pose], (_t(problem.p_w) + u.anchors)[problem.obs_anchor])
-        return (pixel(p_c) - _t(problem.uv)) * _t(problem.inv_sigma)[:, None]
-
-    terms = [(anchors, _delta(config, 5.991))]
-    if (known := problem.depth_priors) is not None:
-
-        def depths(u):
-            p_c = in_camera(poses(u)[known.pose], (_t(problem.p_w) + u.anchors)[known.anchor])
-            return ((1.0 / p_c[:, 2] - _t(known.inverse_depth)) / _t(known.sigma))[:, None]
-
-        terms.append((depths, _delta(config, 5.991)))
-    if problem.edges is not None:
-        terms += _edge_terms(problem, config, poses, in_camera, pixel)
-    if problem.junctions is not None:
-        terms += _junction_terms(problem, config, poses, in_camera, pixel)
-    return terms
-
-
-def _relative(T, host, target):
-    return T[target] @ se3_torch.inverse(T[host])
-
-
-def _edge_terms(problem, config, poses, in_camera, pixel):
-    e = problem.edges
-    fx, fy, cx, cy = problem.K
-    ray = torch.cat(((_t(e.uv) - _t([cx, cy])) / _t([fx, fy]), torch.ones(len(e.host), 1).double()), 1)
-    which, host = e.pair_edge, np.asarray(e.host)[e.pair_edge]
-
-    def depth(u):
-        return _t(e.inverse_depth) + u.edges
-
-    def in_target(u):
-        return in_camera(_relative(poses(u), host, e.pair_pose), (ray / depth(u)[:, None])[which])
-
-    def alignment(u):
-        across = ((pixel(in_target(u)) - _t(e.pair_uv)) * _t(e.pair_normal)).sum(1)
-        return (across * _t(e.pair_inv_sigma))[:, None]
-
-    held = np.asarray(e.pair_inverse_depth) > 0
-
-    def relative_depth(u):
-        z, z_held = in_target(u)[held, 2], 1.0 / _t(e.pair_inverse_depth)[held]
-        return ((z - z_held) / (z + z_held) / e.cycle_sigma)[:, None]
-
-    def round_trip(u):
-        p = in_target(u)[held]
-        at_held_depth = p / p[:, 2:] / _t(e.pair_inverse_depth)[held, None]
-        back = in_camera(_relative(poses(u), e.pair_pose[held], host[held]), at_held_depth)
-        return ((pixel(back) - _t(e.uv)[which[held]]) / e.cycle_sigma).reshape(-1, 1)
-
-    def prior(u):
-        known = np.isfinite(e.prior_sigma)
-        return ((depth(u) - _t(e.prior))[known] / _t(e.prior_sigma)[known])[:, None]
-
-    terms = [(alignment, _delta(config, 3.841)), (prior, None)]
-    if e.cycle_sigma > 0:
-        form = round_trip if e.cycle_px else relative_depth
-        terms.append((form, _delta(config, 3.841)))
-    return terms
-
-
-def _junction_terms(problem, config, poses, in_camera, pixel):
-    c = problem.junctions
-    fx, fy, cx, cy = problem.K
-    rays = (_t(c.uv) - _t([cx, cy])) / _t([fx, fy])
-    rays = torch.cat((rays, torch.ones(*rays.shape[:2], 1).double()), 2)
-    which, host = c.pair_junction, np.asarray(c.host)[c.pair_junction]
-
-    def depth(u):
-        return _t(c.inverse_depth) + u.junctions
-
-    def ends(u):
-        """Pixels ``(Q, 3, 2)`` of corner and arm ends in the target."""
-        T = _relative(poses(u), host, c.pair_pose)
-        p = (rays / depth(u)[..., None])[which]
-        return torch.stack([pixel(in_camera(T, p[:, k])) for k in range(3)], 1)
-
-    def arms(u):
-        uv = ends(u)
-        along = uv[:, 1:] - uv[:, :1]
-        return along / along.norm(dim=2, keepdim=True)
-
-    def corner(u):
-        return ((ends(u)[:, 0] - _t(c.pair_uv)) * c.inv_sigma_px).reshape(-1, 1)
-
-    def angles(u):
-        seen, measured = arms(u), _t(c.pair_arms)
-        if c.cosines:
-            cosine = (seen[:, 0] * seen[:, 1]).sum(1) - (measured[:, 0] * measured[:, 1]).sum(1)
-            return (cosine * c.inv_sigma_angle)[:, None]
-        sine = measured[..., 0] * seen[..., 1] - measured[..., 1] * seen[..., 0]
-        return (sine * c.inv_sigma_angle).reshape(-1, 1)
-
-    root = torch.linalg.cholesky(_t(c.prior_information)).mT
-
-    def prior(u):
-        return (root @ (depth(u) - _t(c.prior))[..., None])[..., 0]
-
-    return [(corner, _delta(config, 3.841)), (angles, _delta(config, 3.841)), (prior, None)]
-
-
-def _delta(config, chi2_95):
-    """Threshold of Huber's kernel: 95 % of normally distributed residuals."""
-    return chi2_95**0.5 if config.robust else math.inf
-
-
-def _t(x):
-    return torch.as_tensor(np.asarray(x, dtype=np.float64))
 
 
 EXACT = LmConfig(behind_px=1e6)
@@ -223,17 +111,6 @@ def window(seed: int, size: WindowSize, **changes: object) -> WindowProblem:
     z = (T[:, 2, :3] * p).sum(1) + T[:, 2, 3]
     priors = DepthPriors(anchor, pose, rng.uniform(0.8, 1.2, n) / z, rng.uniform(0.05, 0.1, n))
     return replace(problem, uv=uv, depth_priors=priors, **changes)
-
-
-def linearised(problem: WindowProblem, config: LmConfig) -> tuple[Window, System]:
-    solver = Window(problem, config)
-    return solver, solver.linearise(solver.start)
-
-
-def moved(solver: Window, state: State) -> torch.Tensor:
-    """Updates of anchors, edges and junctions, in the plain window's order."""
-    parts = [torch.as_tensor(x - block.x).flatten() for block, x in zip(solver.blocks, state.x, strict=True)]
-    return torch.cat(parts)
 
 
 SMALL = WindowSize(poses=5, fixed=2, anchors=14, observations=50, edges=10, pairs=24, junctions=4)
@@ -262,24 +139,19 @@ def test_window_is_the_dense_one(case, solver, monkeypatch):
     if "twice" in changes:
         again = {name: np.concatenate([getattr(problem, name)] * 2) for name in ("obs_pose", "obs_anchor", "inv_sigma")}
         problem = replace(problem, uv=np.concatenate([problem.uv, problem.uv + 1.0]), **again)
-    plain = dense(problem, config)
-    refinement, system = linearised(problem, config)
-    assert system.cost == pytest.approx(float(plain.cost), rel=1e-9)
-    poses = plain.split[0]
-    scale = plain.H.diagonal()[:poses].sqrt()
-    torch.testing.assert_close(torch.as_tensor(system.g) / scale, plain.g[:poses] / scale, rtol=1e-7, atol=1e-7)
-    torch.testing.assert_close(
-        torch.as_tensor(system.H) / scale / scale[:, None],
-        plain.H[:poses, :poses] / scale / scale[:, None],
-        rtol=1e-7,
-        atol=1e-7,
-    )
+    plain, refinement = dense(problem, config), Window(problem, config)
+    system = refinement.linearise(refinement.start)
+    assert system.cost == pytest.approx(plain.cost, rel=1e-9)
+    poses, scale = plain.poses, np.sqrt(np.diag(plain.H)[: plain.poses])
+    np.testing.assert_allclose(system.g / scale, plain.g[:poses] / scale, rtol=1e-7, atol=1e-7)
+    both = np.outer(scale, scale)
+    np.testing.assert_allclose(system.H / both, plain.H[:poses, :poses] / both, rtol=1e-7, atol=1e-7)
     step = refinement.propose(system, MU)
-    assert step is not None
     expected = dense_step(plain, MU)
-    torch.testing.assert_close(moved(refinement, step.state), expected[poses:], rtol=1e-6, atol=1e-8)
-    promised = expected @ (MU * plain.H.diagonal() * expected - plain.g)
-    assert step.predicted == pytest.approx(float(promised), rel=1e-6)
+    moved = [(x - block.x).ravel() for block, x in zip(refinement.blocks, step.state.x, strict=True)]
+    np.testing.assert_allclose(np.concatenate(moved), expected[poses:], rtol=1e-6, atol=1e-8)
+    promised = expected @ (MU * np.diag(plain.H) * expected - plain.g)
+    assert step.predicted == pytest.approx(promised, rel=1e-6)
 
 
 def test_an_anchors_step_is_linear_in_the_inverse_distance_from_its_first_camera():
