@@ -10,7 +10,7 @@ from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.synthetic.flights.courses import COURSES, flown, simulated_camera
-from edgeslam_torch.synthetic.house.render import picture
+from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.types import Frame
 
 BANDS = 8
@@ -25,7 +25,7 @@ def rolled(world, camera, flight, k, readout_s):
     for band in range(BANDS):
         dt = readout_s * ((band + 0.5) / BANDS - 0.5)
         rows = replace(camera, height=height, cy=camera.cy - band * height)
-        parts.append(picture(world, rows, T_w_c @ se3.exp(dt * twist)))
+        parts.append(render(world, rows, T_w_c @ se3.exp(dt * twist), antialias=False).image)
     return np.concatenate(parts)
 
 

@@ -8,7 +8,7 @@ from edgeslam_torch.drone.emulator.air import Air
 from edgeslam_torch.drone.emulator.drone import DroneModel
 from edgeslam_torch.geometry.camera import PRESETS, Camera
 from edgeslam_torch.geometry.mount import camera_on_body
-from edgeslam_torch.synthetic.house.render import picture
+from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.house.world import MAX_LEVEL
 from edgeslam_torch.synthetic.sites.build import place
 from edgeslam_torch.synthetic.sites.site import Site
@@ -75,7 +75,8 @@ def drone_at(
         return float(site.clearance(p_w[None], drone.clock_s)[0])
 
     def paint(T_w_b: FloatArray) -> np.ndarray:
-        return picture(site.painted(drone.clock_s), camera, site.T_site_w @ T_w_b @ T_b_c)
+        T_w_c = site.T_site_w @ T_w_b @ T_b_c
+        return render(site.painted(drone.clock_s), camera, T_w_c, antialias=False).image
 
     drone.clearance = clearance
     return drone, paint, camera

@@ -46,7 +46,7 @@ class Course:
         Raises:
             ValueError: If the world has no free place to fly in.
         """
-        rate_hz = self.rate_hz if rate_hz is None else rate_hz
+        rate_hz = rate_hz or self.rate_hz
         return fly(rng, world, frames, self.path, rate_hz=rate_hz, plan=self.plan, begin_s=self.begin_s)
 
 

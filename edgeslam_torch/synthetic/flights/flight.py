@@ -106,23 +106,14 @@ def fly(
         raise ValueError(f"a flight needs at least one frame and a positive rate, got {frames} at {rate_hz} Hz")
     plan = plan or FlightPlan()
     stamps = np.arange(frames) / rate_hz
-    return _sampled(rng, path(rng, world, stamps[-1] + begin_s + 1.0, plan), stamps, plan, begin_s)
-
-
-def _sampled(
-    rng: np.random.Generator, control: FloatArray, stamps: FloatArray, plan: FlightPlan, begin_s: float
-) -> Flight:
-    """Poses along the spline of control points ``(N, 4)`` (x, y, z, yaw); roll and pitch follow the acceleration.
-
-    ``begin_s`` is the spline's time at the first stamp.
-    """
-    padded = np.vstack([np.repeat(control[:1], DEGREE, axis=0), control, np.repeat(control[-1:], DEGREE, axis=0)])
+    control = path(rng, world, stamps[-1] + begin_s + 1.0, plan)
+    padded = np.pad(control, ((DEGREE, DEGREE), (0, 0)), mode="edge")
     knots = (np.arange(len(padded) + DEGREE + 1) - DEGREE) * KNOT_S
     spline = BSpline(knots, padded, DEGREE)
-    # Sum of a few sines: the drone's jitter, smooth and zero at the start.
     flown = stamps + begin_s
-    fade = 1.0 - np.exp(-((flown / 1.5) ** 2))
     state, velocity, acceleration = (spline(flown, nu=k) for k in range(3))
+    # Sum of a few sines: the drone's jitter, smooth and zero at the start.
+    fade = 1.0 - np.exp(-((flown / 1.5) ** 2))
     frequency, phase = rng.uniform(0.4, 2.2, (6, 4)), rng.uniform(0, 2 * np.pi, (6, 4))
     waves = np.sin(2 * np.pi * frequency * stamps[:, None, None] + phase).mean(2) * 2.0 * fade[:, None]  # (F, 6)
     if plan.wind_m_s2 or plan.gust_m_s2:
@@ -130,15 +121,14 @@ def _sampled(
         state[:, :3] += moved
         velocity[:, :3] += speed
         acceleration[:, :3] += leaning
-    p_w = state[:, :3] + plan.wobble_m * waves[:, :3]
-    wobble_velocity = np.gradient(plan.wobble_m * waves[:, :3], stamps, axis=0) if len(stamps) > 1 else 0.0 * p_w
+    wobble = plan.wobble_m * waves[:, :3]
+    wobble_velocity = np.gradient(wobble, stamps, axis=0) if frames > 1 else 0.0 * wobble
     yaw = state[:, 3]
     c, s = np.cos(yaw), np.sin(yaw)
     forward = (c * acceleration[:, 0] + s * acceleration[:, 1]) / GRAVITY_M_S2
     left = (-s * acceleration[:, 0] + c * acceleration[:, 1]) / GRAVITY_M_S2
-    roll, pitch = -np.arctan(left), np.arctan(forward)
-    rpy = np.stack([roll, pitch, yaw], axis=1) + plan.wobble_rad * waves[:, 3:]
-    T_w_b = np.tile(np.eye(4), (len(stamps), 1, 1))
+    rpy = np.stack([-np.arctan(left), np.arctan(forward), yaw], axis=1) + plan.wobble_rad * waves[:, 3:]
+    T_w_b = np.tile(np.eye(4), (frames, 1, 1))
     T_w_b[:, :3, :3] = Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
-    T_w_b[:, :3, 3] = p_w
+    T_w_b[:, :3, 3] = state[:, :3] + wobble
     return Flight(stamps, T_w_b, camera_on_body(plan.camera_tilt_rad), velocity[:, :3] + wobble_velocity)

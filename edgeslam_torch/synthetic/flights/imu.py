@@ -79,21 +79,13 @@ def simulate_imu(
     q, dq = turn(moments), turn(moments, nu=1)
     rate = 2.0 * _product(q * [-1.0, -1.0, -1.0, 1.0], dq)[:, :3] / np.sum(q * q, axis=1, keepdims=True)
     force = Rotation.from_quat(q).inv().apply(path(moments, nu=2) + [0.0, 0.0, GRAVITY_M_S2])
-    scale = errors.noise
-    rate = rate + _errors(
-        rng, rate, dt, model.gyroscope_noise_density, model.gyroscope_random_walk, errors.gyroscope_bias_rad_s, scale
-    )
-    force = force + _errors(
-        rng,
-        force,
-        dt,
-        model.accelerometer_noise_density,
-        model.accelerometer_random_walk,
-        errors.accelerometer_bias_m_s2,
-        scale,
-    )
+    gyroscope = model.gyroscope_noise_density, model.gyroscope_random_walk, errors.gyroscope_bias_rad_s
+    accelerometer = model.accelerometer_noise_density, model.accelerometer_random_walk, errors.accelerometer_bias_m_s2
     ranges = errors.gyroscope_range_rad_s, errors.accelerometer_range_m_s2
-    rate, force = (np.clip(values, -end, end) for values, end in zip((rate, force), ranges, strict=True))
+    rate, force = (
+        np.clip(values + _errors(rng, values.shape, dt, *sigmas, errors.noise), -end, end)
+        for values, sigmas, end in zip((rate, force), (gyroscope, accelerometer), ranges, strict=True)
+    )
     return ImuReadings(t[0] + moments + (model.time_offset_s or 0.0), rate, force)
 
 
@@ -106,16 +98,15 @@ def _spline(t: FloatArray, values: FloatArray, knots_s: float | None) -> BSpline
     if knots_s is None:
         return make_interp_spline(t, values, k=_DEGREE)
     inner = np.linspace(0.0, t[-1], max(2, round(t[-1] / knots_s) + 1))
-    ends = np.ones(_DEGREE)
     # Knots without a pose between them would leave the spline undetermined there.
     inner = inner[[0, *(1 + np.flatnonzero(np.diff(np.searchsorted(t, inner[:-1])) > 0)), -1]]
-    return make_lsq_spline(t, values, np.concatenate([0.0 * ends, inner, t[-1] * ends]), k=_DEGREE)
+    return make_lsq_spline(t, values, np.pad(inner, _DEGREE, mode="edge"), k=_DEGREE)
 
 
 def _continuous(q: FloatArray) -> FloatArray:
     """Quaternions ``(N, 4)`` with signs by which each is near the one before."""
-    flips = np.sum(q[1:] * q[:-1], axis=1) < 0
-    return q * np.where(np.concatenate([[0], np.cumsum(flips)]) % 2, -1.0, 1.0)[:, None]
+    signs = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)
+    return q * np.cumprod([1.0, *signs])[:, None]
 
 
 def _product(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -125,9 +116,9 @@ def _product(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _errors(
-    rng: np.random.Generator, like: FloatArray, dt: float, density: float, walk: float, bias: float, scale: float
+    rng: np.random.Generator, shape: tuple[int, ...], dt: float, density: float, walk: float, bias: float, scale: float
 ) -> FloatArray:
     """White noise, and a bias that walks from where it is switched on; ``(N, 3)``."""
-    white, steps = rng.standard_normal(like.shape), rng.standard_normal(like.shape)
+    white, steps = rng.standard_normal(shape), rng.standard_normal(shape)
     start = bias * rng.standard_normal(3)
     return scale * density / math.sqrt(dt) * white + start + scale * walk * math.sqrt(dt) * np.cumsum(steps, axis=0)

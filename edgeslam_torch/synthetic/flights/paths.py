@@ -86,8 +86,7 @@ def around(sides_m: tuple[float, float]) -> Path:
 
 def _to_corner(way_m: float, sides_m: tuple[float, float]) -> float:
     """Distance along a rectangle from a place on it to its nearest corner."""
-    length, breadth = sides_m
-    corners = np.array([0.0, length, length + breadth, 2 * length + breadth, 2 * (length + breadth)])
+    corners = np.cumsum([0.0, *sides_m, *sides_m])
     return float(np.abs(way_m % corners[-1] - corners).min())
 
 
@@ -136,14 +135,8 @@ def _cruise(rng: Rng, world: World, rows: list[list[float]], duration_s: float, 
 def _open_view(world: World, p_w: FloatArray, yaw: float, view_m: float) -> float:
     """The direction nearest to ``yaw`` in which the next ``view_m`` metres are free; the freest if none is."""
     reach = np.linspace(0.4, view_m, 8)
-    best, best_free = yaw, -1
-    for turn in np.deg2rad([0, 25, -25, 50, -50, 75, -75, 105, -105, 140, -140, 180]):
-        free = _free_steps(world, p_w, yaw + turn, reach, 0.1)
-        if free > best_free:
-            best, best_free = yaw + float(turn), free
-        if free == len(reach):
-            break
-    return best
+    turns = np.deg2rad([0, 25, -25, 50, -50, 75, -75, 105, -105, 140, -140, 180])
+    return yaw + float(max(turns, key=lambda turn: _free_steps(world, p_w, yaw + turn, reach, 0.1)))
 
 
 def _free_steps(world: World, p_w: FloatArray, yaw: float, reach: FloatArray, least_m: float) -> int:
@@ -174,12 +167,7 @@ def _open_direction(rng: Rng, world: World, p_w: FloatArray) -> float:
     """Among some headings, the one with the longest free flight."""
     yaws = rng.uniform(-np.pi, np.pi) + np.arange(12) * (np.pi / 6)
     reach = np.arange(0.3, 8.0, 0.3)
-    best, best_free = 0.0, -1
-    for yaw in yaws:
-        free = _free_steps(world, p_w, yaw, reach, 0.3)
-        if free > best_free:
-            best, best_free = float(yaw), free
-    return best
+    return float(max(yaws, key=lambda yaw: _free_steps(world, p_w, yaw, reach, 0.3)))
 
 
 def _next_place(rng: Rng, world: World, here: FloatArray, heading: float, plan: FlightPlan) -> FloatArray:

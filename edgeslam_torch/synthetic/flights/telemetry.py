@@ -18,8 +18,13 @@ from edgeslam_torch.types import FloatArray, TelemetrySample
 GRAVITY_M_S2 = 9.81
 FIELDS = ("vgx", "vgy", "vgz", "pitch", "roll", "yaw", "tof", "h", "baro", "bat", "agx", "agy", "agz")
 """SDK names, in the order of `TelemetryLog.rows`."""
+FLIP = np.array([1.0, -1.0, -1.0])
+"""x forward, y right, z down to x forward, y left, z up, and back."""
 TOF_RANGE_M = (0.1, 8.0)
 """Range of the sensor: it reads 10 cm on the floor."""
+_BARO_MEMORY = 0.95
+"""Of the barometer's noise, from one message to the next: two seconds at 10 Hz."""
+_KICK = np.sqrt(1 - _BARO_MEMORY**2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,17 +61,9 @@ class TelemetryFaults:
 
 
 EXACT = TelemetryFaults(
-    jitter_s=0.0,
-    video_delay_s=0.0,
-    velocity_noise_m_s=0.0,
-    velocity_walk=0.0,
-    attitude_noise_rad=0.0,
-    yaw_drift_rad_s=0.0,
-    tof_noise_m=0.0,
-    baro_noise_m=0.0,
-    acceleration_noise_m_s2=0.0,
-    quantise=False,
-)
+    jitter_s=0.0, video_delay_s=0.0, velocity_noise_m_s=0.0, velocity_walk=0.0, attitude_noise_rad=0.0,
+    yaw_drift_rad_s=0.0, tof_noise_m=0.0, baro_noise_m=0.0, acceleration_noise_m_s2=0.0, quantise=False,
+)  # fmt: skip
 """No noise, no delay, no rounding."""
 
 
@@ -83,19 +80,12 @@ class TelemetryLog:
     def samples(self) -> list[TelemetrySample]:
         """The same in SI units and our axes."""
         out = []
-        for stamp, row in zip(self.stamps_s, self.rows, strict=True):
-            value = dict(zip(FIELDS, row, strict=True))
-            flip = np.array([1.0, -1.0, -1.0])  # x forward, y right, z down to x forward, y left, z up
+        for stamp, row in zip(self.stamps_s.tolist(), self.rows, strict=True):
+            pitch, roll, yaw, tof, height, baro, battery = row[3:10].tolist()
+            rpy, force = np.deg2rad([roll, -pitch, -yaw]), 1e-3 * GRAVITY_M_S2 * FLIP * row[10:]
             out.append(
                 TelemetrySample(
-                    float(stamp),
-                    0.1 * flip * [value["vgx"], value["vgy"], value["vgz"]],
-                    np.deg2rad([value["roll"], -value["pitch"], -value["yaw"]]),
-                    0.01 * value["h"],
-                    0.01 * value["tof"],
-                    value["baro"],
-                    1e-3 * GRAVITY_M_S2 * flip * [value["agx"], value["agy"], value["agz"]],
-                    0.01 * value["bat"],
+                    stamp, 0.1 * FLIP * row[:3], rpy, 0.01 * height, 0.01 * tof, baro, force, 0.01 * battery
                 )
             )
         return out
@@ -150,8 +140,8 @@ def simulate(
     floor = p_w[:, 2].min() - 0.1 if floor_m is None else floor_m
     if np.ndim(floor):
         floor = np.asarray(floor)[np.clip(np.searchsorted(t, moments), 0, len(t) - 1)]
-    R_p_w = Rotation.from_euler("z", -yaw0)  # world to power-on axes
-    velocity = R_p_w.apply(_mean_velocity(path, t, moments, 1.0 / faults.rate_hz))
+    power_on = Rotation.from_euler("z", -yaw0)
+    velocity = power_on.apply(_mean_velocity(path, t, moments, 1.0 / faults.rate_hz))
     battery = np.maximum(faults.battery_start - (moments - t[0]) / faults.flight_time_s, 0.0)
     velocity = velocity + _drift(rng, battery, faults) + faults.velocity_noise_m_s * rng.standard_normal(velocity.shape)
     force_b = rotation.inv().apply(_mean_acceleration(path, t, moments) + [0.0, 0.0, GRAVITY_M_S2])
@@ -162,20 +152,10 @@ def simulate(
     angles = np.rad2deg((angles + np.pi) % (2 * np.pi) - np.pi)
     tof = np.clip(p_w[:, 2] - floor + faults.tof_noise_m * rng.standard_normal(len(p_w)), *TOF_RANGE_M)
     rise = p_w[:, 2] - p_w[0, 2]
-    air = 100.0 + rise + _slow_noise(rng, len(rise), faults.baro_noise_m)
-    rows = np.column_stack(
-        [
-            10.0 * velocity * [1.0, -1.0, -1.0],
-            -angles[:, 1],
-            angles[:, 0],
-            -angles[:, 2],
-            100.0 * tof,
-            100.0 * rise,
-            air,
-            100.0 * battery,
-            1e3 / GRAVITY_M_S2 * force_b * [1.0, -1.0, -1.0],
-        ]
-    )
+    air = 100.0 + rise + correlated(_KICK * faults.baro_noise_m * rng.standard_normal(len(rise)), _BARO_MEMORY)
+    turned = angles[:, [1, 0, 2]] * (-1.0, 1.0, -1.0)  # pitch, roll, yaw
+    levels = [100.0 * tof, 100.0 * rise, air, 100.0 * battery]
+    rows = np.column_stack([10.0 * velocity * FLIP, turned, *levels, 1e3 / GRAVITY_M_S2 * force_b * FLIP])
     if faults.quantise:
         rows = _quantised(rows)
     arrival = moments - faults.video_delay_s
@@ -203,12 +183,6 @@ def _drift(rng: np.random.Generator, battery: FloatArray, faults: TelemetryFault
     kick = faults.velocity_walk * np.sqrt(dt) * (1.0 + faults.sag * (1.0 - battery))
     steps = kick[:, None] * rng.standard_normal((len(battery), 3))
     return correlated(steps, np.exp(-dt / faults.bias_memory_s))
-
-
-def _slow_noise(rng: np.random.Generator, count: int, sigma: float) -> FloatArray:
-    """Noise with a correlation time of two seconds at 10 Hz and standard deviation ``sigma``."""
-    keep = 0.95
-    return correlated(np.sqrt(1 - keep**2) * sigma * rng.standard_normal(count), keep)
 
 
 def _quantised(rows: FloatArray) -> FloatArray:

@@ -21,12 +21,9 @@ from edgeslam_torch.synthetic.flights.imu import mounted, simulate_imu
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.house.world import World
-from edgeslam_torch.types import FloatArray
 
 DEPTH_PER_METRE = 5000.0
 """16-bit depth maps hold z in fifths of a millimetre, as in the TUM RGB-D benchmark."""
-
-
 DEPTH_EVERY = 10
 """Frames from one exact depth map to the next."""
 JPEG_QUALITY = 95
@@ -64,13 +61,14 @@ def record_flight(
     Raises:
         OutputError: If something cannot be written.
     """
-    T_w_c = flight.T_w_c
-    rgb, depth = ["# timestamp filename"], ["# timestamp filename"]
+    T_w_c, stamps_s = flight.T_w_c, flight.stamps_s.tolist()
+    names = [f"{stamp:012.6f}" for stamp in stamps_s]  # sorted by time
+    poses = [" ".join(f"{x:.9f}" for x in se3.pose_to_tum(T)) for T in T_w_c]
     try:
         subfolder(folder, "rgb")
         subfolder(folder, "depth")
         save_camera(folder / "camera.yaml", camera)
-        _write_text(folder / "groundtruth.txt", _groundtruth_lines(flight.stamps_s, T_w_c))
+        _write_list(folder / "groundtruth.txt", "tx ty tz qx qy qz qw", stamps_s, poses)
         if telemetry is not None:
             floor = world.floor_below(flight.T_w_b[:, :3, 3])
             log = simulate(rng, flight.stamps_s, T_w_c, flight.T_b_c, faults=telemetry, floor_m=floor)
@@ -81,42 +79,27 @@ def record_flight(
 
         def draw(i: int) -> None:
             view = render(world, camera, T_w_c[i])
-            stamp, twist = float(flight.stamps_s[i]), flight.twist_c(i)
-            noise = np.random.default_rng([seed, i])
-            image = degraded(noise, view.image, view.depth_m, camera, faults, stamp_s=stamp, twist_c=twist)
-            write_image(folder / "rgb" / f"{_name(stamp)}.jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+            noise, twist = np.random.default_rng([seed, i]), flight.twist_c(i)
+            image = degraded(noise, view.image, view.depth_m, camera, faults, stamp_s=stamps_s[i], twist_c=twist)
+            write_image(folder / "rgb" / f"{names[i]}.jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
             if i % DEPTH_EVERY == 0:
                 steps = np.clip(np.rint(view.depth_m * DEPTH_PER_METRE), 0, 65535).astype(np.uint16)
-                write_image(folder / "depth" / f"{_name(stamp)}.png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+                write_image(folder / "depth" / f"{names[i]}.png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
         pool = ThreadPoolExecutor(max_workers=threads)
         try:
-            for i, _ in enumerate(pool.map(draw, range(len(flight.stamps_s)))):
-                stamp = float(flight.stamps_s[i])
-                rgb.append(f"{stamp:.6f} rgb/{_name(stamp)}.jpg")
-                if i % DEPTH_EVERY == 0:
-                    depth.append(f"{stamp:.6f} depth/{_name(stamp)}.png")
+            for i, _ in enumerate(pool.map(draw, range(len(names)))):
                 if on_frame is not None:
                     on_frame(i + 1)
         finally:  # after Ctrl-C the frames that wait are not drawn
             pool.shutdown(cancel_futures=True)
-        _write_text(folder / "rgb.txt", rgb)
-        _write_text(folder / "depth.txt", depth)
+        _write_list(folder / "rgb.txt", "filename", stamps_s, [f"rgb/{name}.jpg" for name in names])
+        depth = [f"depth/{name}.png" for name in names[::DEPTH_EVERY]]
+        _write_list(folder / "depth.txt", "filename", stamps_s[::DEPTH_EVERY], depth)
     except OSError as error:
         raise OutputError(f"{folder}: the simulated flight cannot be written ({error})") from error
 
 
-def _name(stamp_s: float) -> str:
-    """File name that sorts by time."""
-    return f"{stamp_s:012.6f}"
-
-
-def _groundtruth_lines(stamps_s: FloatArray, T_w_c: FloatArray) -> list[str]:
-    lines = ["# timestamp tx ty tz qx qy qz qw"]
-    for stamp, T in zip(stamps_s.tolist(), T_w_c, strict=True):
-        lines.append(f"{stamp:.6f} " + " ".join(f"{x:.9f}" for x in se3.pose_to_tum(T)))
-    return lines
-
-
-def _write_text(path: Path, lines: list[str]) -> None:
-    write_text(path, "\n".join(lines) + "\n")
+def _write_list(path: Path, columns: str, stamps_s: list[float], rows: list[str]) -> None:
+    lines = [f"{stamp:.6f} {row}\n" for stamp, row in zip(stamps_s, rows, strict=True)]
+    write_text(path, "".join([f"# timestamp {columns}\n", *lines]))

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edgeslam_torch.synthetic.house.pieces import build, furniture, stand
+from edgeslam_torch.synthetic.house.pieces import build, drawn, furniture, stand
 from edgeslam_torch.synthetic.house.scene import Place, Scene
+from edgeslam_torch.synthetic.house.world import to_boxes
 from edgeslam_torch.types import FloatArray
 
 Rng = np.random.Generator
@@ -27,9 +28,7 @@ def line_wall(scene: Scene, place: Place, length: float, rng: Rng) -> None:
             x += 1.0
         else:
             name = str(rng.choice(["shelf", "cupboard", "bin", "plant", "cartons", "chair"]))
-            piece = furniture()[name]
-            width = min(float(rng.uniform(*piece.width_m)), 0.9)
-            depth = min(float(rng.uniform(*piece.depth_m)), 0.45)
+            width, depth = np.minimum(drawn(rng, name), (0.9, 0.45)).tolist()
             stand(scene, place.at(x + width / 2 + 0.05, 0.02), rng, name, width, depth)
             x += width + 0.1
         x += rng.uniform(0.15, 0.7)
@@ -71,10 +70,9 @@ def furnish_wall(
                 x += rng.uniform(0.3, 0.9)
             continue
         name = str(rng.choice(names))
-        piece = furniture()[name]
-        width, depth = float(rng.uniform(*piece.width_m)), float(rng.uniform(*piece.depth_m))
+        width, depth = drawn(rng, name)
         spot = place.at(x + width / 2, 0.03)
-        if width > room_left or not fits(scene, spot, width, depth + piece.front_m):
+        if width > room_left or not fits(scene, spot, width, depth + furniture()[name].get("front", 0.0)):
             x += rng.uniform(0.15, 0.4)
             continue
         before = len(scene.boxes)
@@ -106,7 +104,7 @@ def fits(scene: Scene, place: Place, width: float, depth: float) -> bool:
     p = np.array([place.point(np.array([x, y, z])) for x in xs for y in ys for z in (0.2, 0.6)])
     if np.any(p[:, :2] < scene.low_w[:2] - 0.01) or np.any(p[:, :2] > scene.high_w[:2] + 0.01):
         return False
-    return all(np.all(box.distance(p) > 0.03) for box in scene.boxes)
+    return bool(np.all(to_boxes(scene.boxes)(p) > 0.03))
 
 
 def lamps_anywhere(scene: Scene, rng: Rng) -> None:

@@ -1,7 +1,7 @@
 """The builder of `furniture.toml`: what stands, hangs and lies in a scene, each piece at a `Place` of its own axes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -19,36 +19,27 @@ Rng = np.random.Generator
 FILE = Path(__file__).parent.parent / "furniture.toml"
 
 
-@dataclass(frozen=True, slots=True)
-class Furniture:
-    """How much floor a piece takes that stands along walls [m]."""
-
-    width_m: tuple[float, float]
-    depth_m: tuple[float, float]
-    front_m: float
-    """Floor kept free before it."""
-    centred: bool
-    """Whether its origin is in its middle; else it is in the middle of its back."""
-
-
 @cache
 def _tables() -> dict[str, Any]:
     return read_mapping(FILE, "TOML", ConfigError)
 
 
 @cache
-def furniture() -> dict[str, Furniture]:
-    """The pieces that stand along walls, by name."""
-    return {
-        name: Furniture(tuple(t["width"]), tuple(t["depth"]), t.get("front", 0.0), t.get("centred", False))
-        for name, t in _tables().items()
-        if "width" in t
-    }
+def furniture() -> dict[str, dict[str, Any]]:
+    """The tables of pieces that stand along walls, by name: ``width`` and ``depth`` from least to most [m], and what
+    `furniture.toml` says."""
+    return {name: table for name, table in _tables().items() if "width" in table}
+
+
+def drawn(rng: Rng, name: str) -> tuple[float, float]:
+    """Width and depth of a piece of furniture [m]."""
+    width, depth = (float(rng.uniform(*furniture()[name][key])) for key in ("width", "depth"))
+    return width, depth
 
 
 def stand(scene: Scene, place: Place, rng: Rng, name: str, width: float, depth: float) -> None:
     """Add a piece of furniture with its back at ``place``."""
-    at = place.at(0, depth / 2) if furniture()[name].centred else place
+    at = place.at(0, depth / 2) if furniture()[name].get("centred") else place
     build(scene, at, rng, name, width=width, depth=depth)
 
 
@@ -127,29 +118,19 @@ def _paints(rng: Rng) -> dict[str, Callable[..., Any]]:
     """What text may call to paint something."""
 
     def paint(*kinds: str | tuple[str, ...], vivid: float = 0.04) -> Paint:
-        return random_paint(
-            rng, tuple(k for kind in kinds for k in ([kind] if isinstance(kind, str) else kind)), vivid=vivid
-        )
+        names = [name for kind in kinds for name in ([kind] if isinstance(kind, str) else kind)]
+        return random_paint(rng, names, vivid=vivid)
 
-    def variant() -> int:
-        return int(rng.integers(VARIANTS))
-
-    def glowing(paint: Paint, gain: float = 1.0) -> Paint:
-        blue, green, red = (float(gain * t) for t in paint.tint)
-        return replace(paint, tint=(blue, green, red), glow=True)
+    def image(kind: str) -> Paint:
+        gain = np.exp(rng.normal(0.0, 0.06, 3))
+        return Paint(kind, int(rng.integers(VARIANTS)), tuple(gain.tolist()))
 
     return {
         "paint": paint,
-        "variant": variant,
-        "image": lambda kind: picture_paint(rng, kind),
+        "variant": lambda: int(rng.integers(VARIANTS)),
+        "image": image,
         "plain": lambda kind, number=0, blue=1.0, green=1.0, red=1.0: Paint(kind, number, (blue, green, red)),
         "dyed": lambda paint, blue, green, red: Paint(paint.kind, paint.variant, (blue, green, red)),
         "tinted": lambda kind, number, like: Paint(kind, number, like.tint),
-        "glowing": glowing,
+        "glowing": lambda paint, gain=1.0: replace(paint, tint=tuple(gain * t for t in paint.tint), glow=True),
     }
-
-
-def picture_paint(rng: Rng, kind: str) -> Paint:
-    """One of the pictures of a kind, slightly tinted."""
-    gain = np.exp(rng.normal(0.0, 0.06, 3))
-    return Paint(kind, int(rng.integers(VARIANTS)), (float(gain[0]), float(gain[1]), float(gain[2])))

@@ -7,31 +7,20 @@ Borders are smoothed by five samples per pixel: its centre and, shared with its 
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.synthetic.house.world import MAX_LEVEL, World
+from edgeslam_torch.synthetic.house.world import MAX_LEVEL, Texture, World
 from edgeslam_torch.synthetic.textures.image_ops import looked_up
 from edgeslam_torch.types import FloatArray
 
 NEAR_M = 0.02
 BACKGROUND = 90
 """Grey level where nothing is hit."""
-
-
-@dataclass(frozen=True, slots=True)
-class Rendered:
-    """One view of a `World`."""
-
-    image: np.ndarray
-    """``(H, W, 3)`` uint8 BGR."""
-    depth_m: FloatArray
-    """``(H, W)`` float32 z-depth of the ray through each pixel centre [m]; 0 where nothing is hit."""
-    quad_id: np.ndarray
-    """``(H, W)`` int32 index into ``world.quads``; -1 where nothing is hit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,22 +32,39 @@ class _Polygon:
     """Three to five corners [px]."""
     st_from_uv: FloatArray
     """``(3, 3)`` homography from pixels to texture coordinates in [0, 1]; third row times (u, v, 1) is 1/z."""
+    det: float
+    """Determinant of its inverse."""
+    side_m: float
+    """Distance of the camera from the plane."""
     iz_range: tuple[float, float]
-    level_offset: float
-    """g of level = g - 3.5 log2(1/z), where one texel covers one pixel."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Spans:
-    """The polygons' pixels on one sampling grid: columns ``low..high`` on each row."""
+class Rendered:
+    """One view of a `World`; its picture is drawn when it is first asked for, which takes half of the time."""
 
-    roi: np.ndarray
-    """``(P, 4)`` x0, y0, x1, y1, exclusive ends; empty where x0 >= x1."""
-    start: np.ndarray
-    """``(P,)`` where each polygon's rows begin in ``low`` and ``high``, counted as if they began at its y0."""
-    low: np.ndarray
-    high: np.ndarray
-    """``(rows,)`` int32, inclusive."""
+    def __init__(self, world: World, camera: Camera, T_w_c: FloatArray, antialias: bool) -> None:
+        self._world, self._antialias = world, antialias
+        self._polygons = _project(world, camera, T_w_c)
+        self._iz, self.quad_id, self._roi = _depth_pass(self._polygons, camera.width, camera.height, 0.0)
+        """Inverse depth; ``(H, W)`` int16 index into ``world.quads``, -1 where nothing is hit; see `_depth_pass`."""
+
+    @cached_property
+    def depth_m(self) -> FloatArray:
+        """``(H, W)`` float32 z-depth of the ray through each pixel centre [m]; 0 where nothing is hit."""
+        with np.errstate(divide="ignore"):
+            return np.where(self._iz > 0, np.float32(1.0) / self._iz, np.float32(0.0))
+
+    @cached_property
+    def image(self) -> np.ndarray:
+        """``(H, W, 3)`` uint8 BGR."""
+        image = np.full((*self._iz.shape, 3), BACKGROUND, np.uint8)
+        seen = np.bincount(self.quad_id.ravel() + 1, minlength=len(self._world.quads) + 1)[1:] > 0
+        for polygon, roi in zip(self._polygons, self._roi, strict=True):
+            if seen[polygon.quad]:
+                _draw(image, self._iz, self.quad_id, polygon, roi, self._world.quads[polygon.quad].texture)
+        if self._antialias:
+            _smooth_borders(image, self.quad_id, [p for p in self._polygons if seen[p.quad]])
+        return image
 
 
 def render(world: World, camera: Camera, T_w_c: FloatArray, *, antialias: bool = True) -> Rendered:
@@ -73,45 +79,13 @@ def render(world: World, camera: Camera, T_w_c: FloatArray, *, antialias: bool =
     Raises:
         ValueError: If the camera has distortion.
     """
-    image, iz, ids = _drawn(world, camera, T_w_c, antialias)
-    return Rendered(image, _depth(iz), ids.astype(np.int32))
-
-
-def picture(world: World, camera: Camera, T_w_c: FloatArray) -> np.ndarray:
-    """The image of `render` alone, ``(H, W, 3)`` uint8 BGR, borders not smoothed: for live pictures."""
-    return _drawn(world, camera, T_w_c, antialias=False)[0]
-
-
-def depth_map(world: World, camera: Camera, T_w_c: FloatArray) -> FloatArray:
-    """The depth of `render` alone, ``(H, W)`` [m], borders not smoothed: at half of its time."""
-    return _depth(_depth_pass(_project(world, camera, T_w_c), camera.width, camera.height, 0.0)[0])
-
-
-def _depth(iz: FloatArray) -> FloatArray:
-    with np.errstate(divide="ignore"):
-        return np.where(iz > 0, np.float32(1.0) / iz, np.float32(0.0))
-
-
-def _drawn(
-    world: World, camera: Camera, T_w_c: FloatArray, antialias: bool
-) -> tuple[np.ndarray, FloatArray, np.ndarray]:
-    """Image, inverse depth, and quad index int16."""
-    polygons = _project(world, camera, T_w_c)
-    iz, ids, spans = _depth_pass(polygons, camera.width, camera.height, 0.0)
-    image = np.full((camera.height, camera.width, 3), BACKGROUND, np.uint8)
-    seen = np.bincount(ids.ravel() + 1, minlength=len(world.quads) + 1)[1:] > 0
-    for polygon, roi in zip(polygons, spans.roi.tolist(), strict=True):
-        if seen[polygon.quad]:
-            _draw(image, iz, ids, polygon, roi, world)
-    if antialias:
-        _smooth_borders(image, ids, [p for p in polygons if seen[p.quad]])
-    return image, iz, ids
+    if camera.is_distorted:
+        raise ValueError("simulated cameras have no distortion")
+    return Rendered(world, camera, T_w_c, antialias)
 
 
 def _project(world: World, camera: Camera, T_w_c: FloatArray) -> list[_Polygon]:
     """The quads that face the camera and reach into the image, nearest first."""
-    if camera.is_distorted:
-        raise ValueError("simulated cameras have no distortion")
     T_c_w = se3.inverse(np.asarray(T_w_c, dtype=np.float64))
     side = np.einsum("qi,qi->q", world.normals_w, T_w_c[:3, 3] - world.corners_w[:, 0])
     corners = world.corners_w @ T_c_w[:3, :3].T + T_c_w[:3, 3]  # (Q, 4, 3)
@@ -126,26 +100,15 @@ def _project(world: World, camera: Camera, T_w_c: FloatArray) -> list[_Polygon]:
         return []
     c = corners[index]
     frame = camera.K @ np.stack([c[:, 1] - c[:, 0], c[:, 3] - c[:, 0], c[:, 0]], axis=2)  # columns u, v, origin
-    st_from_uv = np.linalg.inv(frame)
-    # Texels per pixel are det(st_from_uv) / iz^3 times the texture's size. Half an octave more for each doubling
-    # of obliqueness, cos = plane distance times iz, keeps grazing surfaces from flickering.
-    texels = np.array([world.quads[k].texture.texels for k in index.tolist()]) / np.abs(np.linalg.det(frame))
-    level_offset = (np.log2(texels) - 0.5 * np.log2(np.abs(side[index]))).tolist()
-    near, far = c[:, :, 2].min(1), c[:, :, 2].max(1)
-    clipped = near < NEAR_M
-    ahead = np.maximum(c[:, :, 2], NEAR_M)
-    uv_all = np.stack([camera.fx * c[:, :, 0] / ahead + camera.cx, camera.fy * c[:, :, 1] / ahead + camera.cy], axis=2)
+    st_from_uv, det = np.linalg.inv(frame), np.abs(np.linalg.det(frame))
     polygons = []
-    for row, (quad, corners_uv) in enumerate(zip(index.tolist(), uv_all.tolist(), strict=True)):
-        iz_range = (1.0 / far[row], 1.0 / near[row])
-        if clipped[row]:
-            points = _clip(c[row].tolist())
-            if len(points) < 3:
-                continue
-            corners_uv = [[camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy] for p in points]
-            izs = [1.0 / p[2] for p in points]
-            iz_range = (min(izs), max(izs))
-        polygons.append(_Polygon(quad, corners_uv, st_from_uv[row], iz_range, level_offset[row]))
+    for row, quad in enumerate(index.tolist()):
+        points = _clip(c[row].tolist())
+        if len(points) < 3:
+            continue
+        uv = [[camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy] for p in points]
+        izs = [1.0 / p[2] for p in points]
+        polygons.append(_Polygon(quad, uv, st_from_uv[row], det[row], abs(side[quad]), (min(izs), max(izs))))
     polygons.sort(key=lambda p: -p.iz_range[1])
     return polygons
 
@@ -164,41 +127,43 @@ def _clip(points: list[list[float]]) -> list[list[float]]:
 
 def _depth_pass(
     polygons: list[_Polygon], width: int, height: int, offset: float
-) -> tuple[FloatArray, np.ndarray, _Spans]:
-    """Inverse depth ``(height, width)`` float32 and quad index int16, at integer pixels plus ``offset``."""
+) -> tuple[FloatArray, np.ndarray, list[list[int]]]:
+    """Inverse depth ``(height, width)`` float32, quad index int16, and x0, y0, x1, y1 of where polygons may be seen, at
+    integer pixels plus ``offset``."""
     iz = np.zeros((height, width), np.float32)
     ids = np.full((height, width), -1, np.int16)
-    spans = _spans(polygons, width, height, offset)
+    top, low, high = _spans(polygons, width, height, offset)
     columns = np.arange(width, dtype=np.int32)
     planes = np.array([p.st_from_uv[2] for p in polygons]).reshape(-1, 3)
     planes[:, 2] += offset * (planes[:, 0] + planes[:, 1])
-    for polygon, (x0, y0, x1, y1), start, (a, b, c) in zip(
-        polygons, spans.roi.tolist(), spans.start.tolist(), planes.tolist(), strict=True
-    ):
+    rois = []
+    for polygon, y0, first, last, (a, b, c) in zip(polygons, top, low, high, planes.tolist(), strict=True):
+        x0, x1, y1 = int(first.min(initial=width)), int(last.max(initial=-1)) + 1, y0 + len(first)
+        rois.append([x0, y0, x1, y1])
         if x0 >= x1:
             continue
         xs, ys = columns[x0:x1], np.arange(y0, y1)
         here = (a * xs).astype(np.float32) + (b * ys + c).astype(np.float32)[:, None]
         target = iz[y0:y1, x0:x1]
         nearer = here > target
-        rows = slice(start, start + y1 - y0)
-        nearer &= xs >= spans.low[rows, None]
-        nearer &= xs <= spans.high[rows, None]
+        nearer &= xs >= first[:, None]
+        nearer &= xs <= last[:, None]
         cv2.copyTo(here, nearer.view(np.uint8), target)
         np.copyto(ids[y0:y1, x0:x1], polygon.quad, where=nearer)
-    return iz, ids, spans
+    return iz, ids, rois
 
 
-def _spans(polygons: list[_Polygon], width: int, height: int, offset: float) -> _Spans:
-    """First and last column inside each convex polygon on each of its rows."""
+def _spans(
+    polygons: list[_Polygon], width: int, height: int, offset: float
+) -> tuple[list[int], list[np.ndarray], list[np.ndarray]]:
+    """Of each convex polygon the first row, and the first and last column on each of its rows."""
     count = len(polygons)
     uv = np.array([p.uv + [p.uv[-1]] * (5 - len(p.uv)) for p in polygons]).reshape(-1, 5, 2) - offset
     top = np.clip(np.ceil(uv[:, :, 1].min(1)), 0, height).astype(np.int64)
-    bottom = np.clip(np.floor(uv[:, :, 1].max(1)) + 1, top, height).astype(np.int64)
-    rows = bottom - top
-    start = np.cumsum(rows) - rows
+    rows = np.clip(np.floor(uv[:, :, 1].max(1)) + 1, top, height).astype(np.int64) - top
+    end = np.cumsum(rows)
     owner = np.repeat(np.arange(count), rows)
-    y = (np.arange(len(owner)) - start[owner] + top[owner]).astype(np.float64)
+    y = (np.arange(len(owner)) - (end - rows)[owner] + top[owner]).astype(np.float64)
     following = np.roll(uv, -1, axis=1)
     edge = following - uv
     area = np.sum(uv[..., 0] * following[..., 1] - uv[..., 1] * following[..., 0], axis=1)
@@ -208,39 +173,32 @@ def _spans(polygons: list[_Polygon], width: int, height: int, offset: float) -> 
         slope = np.divide(dx, dy, out=np.zeros(count), where=dy != 0)
         cut = (y - uv[owner, k, 1]) * slope[owner] + uv[owner, k, 0]
         # With positive area the inside lies where dx (y - y0) - dy (x - x0) >= 0.
-        bounds_low = (np.sign(area) * dy < 0)[owner]
-        bounds_high = (np.sign(area) * dy > 0)[owner]
-        np.maximum(low, cut, out=low, where=bounds_low)
-        np.minimum(high, cut, out=high, where=bounds_high)
-    first, last = np.ceil(low).astype(np.int32), np.floor(high).astype(np.int32)
-    roi = np.zeros((count, 4), np.int64)
-    nonempty = np.flatnonzero(rows)
-    if len(nonempty):
-        left = np.minimum.reduceat(first, start[nonempty])
-        right = np.maximum.reduceat(last, start[nonempty]) + 1
-        roi[nonempty] = np.stack([left, top[nonempty], right, bottom[nonempty]], axis=1)
-    return _Spans(roi, start, first, last)
+        inwards = (np.sign(area) * dy)[owner]
+        np.maximum(low, cut, out=low, where=inwards < 0)
+        np.minimum(high, cut, out=high, where=inwards > 0)
+    first, last = (np.split(x.astype(np.int32), end[:-1]) for x in (np.ceil(low), np.floor(high)))
+    return top.tolist(), first[:count], last[:count]
 
 
-def _texture_from_st(level: np.ndarray) -> FloatArray:
-    """Texture pixels (centres at integers) from [0, 1] coordinates."""
-    h, w = level.shape[:2]
-    return np.array([[w, 0.0, -0.5], [0.0, h, -0.5], [0.0, 0.0, 1.0]])
-
-
-def _draw(image: np.ndarray, iz: FloatArray, ids: np.ndarray, polygon: _Polygon, roi: list[int], world: World) -> None:
+def _draw(
+    image: np.ndarray, iz: FloatArray, ids: np.ndarray, polygon: _Polygon, roi: list[int], texture: Texture
+) -> None:
     """Colour the pixels where this quad is the nearest."""
     x0, y0, x1, y1 = roi
     mine = (ids[y0:y1, x0:x1] == polygon.quad).view(np.uint8)
     bx, by, bw, bh = cv2.boundingRect(mine)
     mine = mine[by : by + bh, bx : bx + bw]
     x0, y0 = x0 + bx, y0 + by
-    texture, g = world.quads[polygon.quad].texture, polygon.level_offset
+    # One texel covers one pixel at level g - 3.5 log2(1/z): texels per pixel are det(st_from_uv) / iz^3 times the
+    # texture's size. Half an octave more for each doubling of obliqueness, cos = plane distance times iz, keeps grazing
+    # surfaces from flickering.
+    texels = math.prod(texture.level(0).shape[:2])
+    g = float(np.log2(texels / polygon.det) - 0.5 * np.log2(polygon.side_m))
     a, b, c = polygon.st_from_uv[2].tolist()
     at_corners = [a * x + b * y + c for x in (x0, x0 + bw - 1) for y in (y0, y0 + bh - 1)]
     near = min(max(at_corners), polygon.iz_range[1])
     far = max(min(at_corners), polygon.iz_range[0])
-    first, last = _level_at(near, g), _level_at(far, g)
+    first, last = (min(max(math.floor(g - 3.5 * math.log2(max(x, 1e-6)) + 0.5), 0), MAX_LEVEL) for x in (near, far))
     for k in range(first, last + 1):
         mask, left, top, w, h = mine, 0, 0, bw, bh
         if first != last:
@@ -255,8 +213,9 @@ def _draw(image: np.ndarray, iz: FloatArray, ids: np.ndarray, polygon: _Polygon,
                 continue
             mask = mask[top : top + h, left : left + w]
         level = texture.level(k)
-        texture_from_uv = _texture_from_st(level) @ polygon.st_from_uv
-        drawn = looked_up(level, *_mapped(texture_from_uv, x0 + left, y0 + top, w, h))
+        rows, columns = level.shape[:2]
+        texture_from_st = np.array([[columns, 0.0, -0.5], [0.0, rows, -0.5], [0.0, 0.0, 1.0]])  # centres at integers
+        drawn = looked_up(level, *_mapped(texture_from_st @ polygon.st_from_uv, x0 + left, y0 + top, w, h))
         cv2.copyTo(drawn, mask, image[y0 + top : y0 + top + h, x0 + left : x0 + left + w])
 
 
@@ -266,10 +225,6 @@ def _mapped(H: FloatArray, x0: int, y0: int, width: int, height: int) -> tuple[F
     u, v, w = (row[0] * x + (row[1] * y + row[2]) for row in H)
     per_w = 1.0 / w
     return u * per_w, v * per_w
-
-
-def _level_at(iz: float, g: float) -> int:
-    return min(max(math.floor(g - 3.5 * math.log2(max(iz, 1e-6)) + 0.5), 0), MAX_LEVEL)
 
 
 def _iz_of_level(level: float, g: float) -> np.float32:

@@ -1,12 +1,13 @@
 """Assembling a `World`: surfaces, solids and lamps, with light baked into every texture."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache, partial
 
 import cv2
 import numpy as np
 
-from edgeslam_torch.synthetic.house.world import Box, Quad, Texture, World
+from edgeslam_torch.synthetic.house.world import Box, Quad, Texture, World, to_boxes
 from edgeslam_torch.synthetic.textures import materials, pictures
 from edgeslam_torch.synthetic.textures.image_ops import product, resized, shrunk
 from edgeslam_torch.types import FloatArray
@@ -55,7 +56,7 @@ class Paint:
     kind: str
     """A name in `materials.MATERIALS` or `PICTURES`."""
     variant: int = 0
-    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    tint: tuple[float, ...] = (1.0, 1.0, 1.0)
     """BGR gain."""
     zoom: float = 1.0
     """Magnification of a material's pattern."""
@@ -67,18 +68,12 @@ class Paint:
     """Emissive: not shaded."""
 
 
-def random_paint(rng: np.random.Generator, kinds: tuple[str, ...], turned: bool = False, vivid: float = 0.04) -> Paint:
+def random_paint(rng: np.random.Generator, kinds: Sequence[str], turned: bool = False, vivid: float = 0.04) -> Paint:
     """Paint of a random kind among ``kinds``, its colour varied."""
     kind = str(rng.choice(kinds))
     gain = np.exp(rng.normal(0.0, 0.12) + rng.normal(0.0, vivid, 3))
-    return Paint(
-        kind,
-        int(rng.integers(VARIANTS)),
-        (float(gain[0]), float(gain[1]), float(gain[2])),
-        float(np.exp(rng.uniform(-0.35, 0.35))),
-        turned,
-        (float(rng.random()), float(rng.random())),
-    )
+    variant, zoom = int(rng.integers(VARIANTS)), float(np.exp(rng.uniform(-0.35, 0.35)))
+    return Paint(kind, variant, tuple(gain.tolist()), zoom, turned, (rng.random(), rng.random()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,29 +101,15 @@ class Place:
         return Place(float(p[0]), float(p[1]), self.yaw_rad + yaw_rad, float(p[2]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Surface:
-    """A parallelogram before its light is baked."""
-
-    origin_w: FloatArray
-    u_w: FloatArray
-    v_w: FloatArray
-    paint: Paint
-    name: str
-    two_sided: bool
-    solid: int
-    """Index of the solid it bounds, -1 for none."""
-
-
 @dataclass
 class Scene:
-    """A world being put together; `world()` bakes it."""
+    """A world being put together; its light is computed and baked when it is first seen."""
 
     low_w: FloatArray
     high_w: FloatArray
     """Inner corners of the room [m]."""
     texel_m: float = 0.004
-    surfaces: list[Surface] = field(default_factory=list)
+    quads: list[Quad] = field(default_factory=list)
     boxes: list[Box] = field(default_factory=list)
     unseen: list[Box] = field(default_factory=list)
     """Glass: solid and not painted."""
@@ -150,8 +131,9 @@ class Scene:
         solid: int = -1,
     ) -> None:
         """Add a parallelogram; see `Quad` for its sides."""
-        arrays = [np.asarray(a, dtype=np.float64) for a in (origin_w, u_w, v_w)]
-        self.surfaces.append(Surface(arrays[0], arrays[1], arrays[2], paint, name, two_sided, solid))
+        origin_w, u_w, v_w = (np.asarray(a, dtype=np.float64) for a in (origin_w, u_w, v_w))
+        texture = Texture(partial(_bake, len(self.quads), self, paint))
+        self.quads.append(Quad(origin_w, u_w, v_w, texture, name, two_sided, solid))
 
     def box(
         self,
@@ -207,17 +189,13 @@ class Scene:
             self.surface(place.point(origin), place.direction(v), place.direction(u), paint, name, solid=solid)
 
     def world(self, name: str) -> World:
-        """The world as it is now; its light is computed and baked when it is first seen."""
-        quads = [
-            Quad(s.origin_w, s.u_w, s.v_w, Texture(partial(_bake, k, self)), s.name, s.two_sided)
-            for k, s in enumerate(self.surfaces)
-        ]
-        return World(quads, name, np.stack([self.low_w, self.high_w]), self.boxes, unseen=self.unseen)
+        """The world as it is now."""
+        return World(self.quads, name, np.stack([self.low_w, self.high_w]), self.boxes, self.unseen)
 
     @cached_property
     def light_maps(self) -> list[FloatArray]:
         """Light at a grid of points of every surface, 1.0 on average."""
-        origin, u, v = (np.array([getattr(s, k) for s in self.surfaces]) for k in ("origin_w", "u_w", "v_w"))
+        origin, u, v = (np.array([getattr(q, k) for q in self.quads]) for k in ("origin_w", "u_w", "v_w"))
         normal = np.cross(v, u)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         columns = np.clip(np.ceil(np.linalg.norm(u, axis=1) / LIGHT_GRID_M), 2, 80).astype(int)
@@ -228,7 +206,7 @@ class Scene:
         j, i = np.divmod(np.arange(len(owner)) - start[owner], columns[owner])
         a, b = ((i + 0.5) / columns[owner])[:, None], ((j + 0.5) / rows[owner])[:, None]
         p = origin[owner] + a * u[owner] + b * v[owner] + 0.004 * normal[owner]
-        solid = np.array([s.solid for s in self.surfaces])[owner]
+        solid = np.array([q.solid for q in self.quads])[owner]
         light = self._light(p.T.astype(np.float32), normal[owner].T.astype(np.float32), solid)
         return [light[s : s + r * c].reshape(r, c) for s, r, c in zip(start, rows, columns, strict=True)]
 
@@ -265,7 +243,7 @@ class Scene:
         """Share of a lamp that points see past the solids, ``(N,)``: 1 lit, 0 in shadow."""
         seen = np.ones(len(solid), np.float32)
         for k, box in enumerate(self.boxes):
-            if box.half_m.max() < 0.12 or box.distance(lamp) == 0:
+            if box.half_m.max() < 0.12 or to_boxes([box])(lamp) == 0:
                 continue
             half = box.half_m.astype(np.float32)
             b = _local(box, lamp.astype(np.float32)[:, None])
@@ -305,11 +283,10 @@ def _rhombi(start: FloatArray, path: list[FloatArray]) -> list[tuple[FloatArray,
     return out
 
 
-def _bake(index: int, scene: Scene) -> np.ndarray:
+def _bake(index: int, scene: Scene, paint: Paint) -> np.ndarray:
     """Texture of a surface: its paint times its light."""
-    surface, light = scene.surfaces[index], scene.light_maps[index]
-    width_m, height_m = float(np.linalg.norm(surface.u_w)), float(np.linalg.norm(surface.v_w))
-    paint = surface.paint
+    quad, light = scene.quads[index], scene.light_maps[index]
+    width_m, height_m = float(np.linalg.norm(quad.u_w)), float(np.linalg.norm(quad.v_w))
     if paint.kind in PICTURES:
         image = picture(paint.kind, paint.variant)
         if paint.turned:

@@ -4,7 +4,7 @@ import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.dressing import fits, furnish_wall, lamps_anywhere, rug
-from edgeslam_torch.synthetic.house.pieces import build, furniture, stand
+from edgeslam_torch.synthetic.house.pieces import build, drawn, furniture, stand
 from edgeslam_torch.synthetic.house.render import Rendered, render
 from edgeslam_torch.synthetic.house.scene import Place, Scene, random_paint
 from edgeslam_torch.synthetic.house.walls import SIDES, shell, side_of
@@ -69,8 +69,7 @@ def _in_the_middle(scene: Scene, rng: Rng) -> None:
             build(scene, place, rng, "cartons")
     else:
         name = str(rng.choice(list(furniture())))
-        piece = furniture()[name]
-        width, depth = float(rng.uniform(*piece.width_m)), float(rng.uniform(*piece.depth_m))
+        width, depth = drawn(rng, name)
         if fits(scene, place, width, depth):
             stand(scene, place, rng, name, width, depth)
 

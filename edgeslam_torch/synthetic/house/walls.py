@@ -1,7 +1,6 @@
 """The walls of a scene: its outer shell, walls with openings and doors between its parts, and solid blocks."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -29,6 +28,18 @@ class Opening:
     height_m: float = DOOR_HEIGHT_M
     leaf_rad: float | None = None
     """A door leaf hung at its first side, opened by this angle; None for no leaf, 0 for a closed door."""
+
+
+@dataclass(slots=True)
+class Wall:
+    """An upright wall at ``at`` on ``axis``, along the other axis from ``low`` to ``high``."""
+
+    axis: int
+    at: float
+    low: float
+    high: float
+    openings: list[Opening] = field(default_factory=list)
+    """In order along the wall, without overlap."""
 
 
 def shell(
@@ -76,33 +87,23 @@ def block(scene: Scene, low: FloatArray, high: FloatArray, paint: dict[str, Pain
     scene.box(Place(0.0, 0.0, 0.0), (*centre, tall / 2), (*size, tall), paint["f"], "wall", faces="frbl", special=paint)
 
 
-def wall(scene: Scene, rng: Rng, ends_w: FloatArray, openings: Sequence[Opening], kinds: tuple[str, ...]) -> None:
-    """Build an upright wall between two points of the floor.
-
-    Args:
-        scene: What it is added to.
-        rng: Of its paint.
-        ends_w: ``(2, 2)`` first and second end of its middle line [m].
-        openings: In order along the wall, without overlap.
-        kinds: Materials to choose from.
-    """
-    along = ends_w[1] - ends_w[0]
-    length, yaw = float(np.linalg.norm(along)), float(np.arctan2(along[1], along[0]))
-    first = Place(float(ends_w[0, 0]), float(ends_w[0, 1]), yaw)
+def raise_wall(scene: Scene, rng: Rng, wall: Wall, kinds: tuple[str, ...]) -> None:
+    """Build a wall; ``kinds`` are the materials to choose from."""
+    first = Place(wall.low, wall.at, 0.0) if wall.axis else Place(wall.at, wall.low, np.pi / 2)
     height = float(scene.high_w[2])
     paint = {face: random_paint(rng, kinds) for face in "fb"}
     reached = 0.0
-    for opening in openings:
+    for opening in wall.openings:
         low, high = opening.at_m - opening.width_m / 2, opening.at_m + opening.width_m / 2
         _part(scene, first, (reached, low), (0.0, height), paint)
         if opening.height_m < height:
             _part(scene, first, (low, high), (opening.height_m, height), paint)
             build(scene, first, rng, "frame", at=opening.at_m, wide=opening.width_m, height=opening.height_m)
         if opening.leaf_rad is not None:
-            hinge = first.at(low, 0.0).at(0.0, 0.0, yaw_rad=opening.leaf_rad)
+            hinge = first.at(low, 0.0, yaw_rad=opening.leaf_rad)
             build(scene, hinge, rng, "leaf", wide=opening.width_m, height=opening.height_m)
         reached = high
-    _part(scene, first, (reached, length), (0.0, height), paint)
+    _part(scene, first, (reached, wall.high - wall.low), (0.0, height), paint)
 
 
 def _part(scene: Scene, first: Place, x: tuple[float, float], z: tuple[float, float], paint: dict[str, Paint]) -> None:

@@ -1,7 +1,7 @@
 """Worlds of scene files: the one builder of rooms, corridors and buildings."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -12,7 +12,7 @@ from edgeslam_torch.synthetic.house import dressing
 from edgeslam_torch.synthetic.house.pieces import build
 from edgeslam_torch.synthetic.house.scene import Place, Scene, random_paint
 from edgeslam_torch.synthetic.house.values import Values
-from edgeslam_torch.synthetic.house.walls import SIDES, Opening, block, shell, side_of, wall
+from edgeslam_torch.synthetic.house.walls import SIDES, Opening, Wall, block, raise_wall, shell, side_of
 from edgeslam_torch.synthetic.house.world import Box, World
 from edgeslam_torch.synthetic.sites.mirror import mirrored
 from edgeslam_torch.synthetic.sites.obstacles import connected, stand_in_the_way
@@ -39,17 +39,6 @@ _OPEN_RAD = (1.6, 1.8)
 
 
 @dataclass(slots=True)
-class _Wall:
-    """A wall at ``at`` on ``axis``, along the other axis from ``low`` to ``high``."""
-
-    axis: int
-    at: float
-    low: float
-    high: float
-    openings: list[Opening] = field(default_factory=list)
-
-
-@dataclass(slots=True)
 class _Layout:
     """A scene being built, in its own axes."""
 
@@ -58,7 +47,7 @@ class _Layout:
     """x, y and heading [degrees]."""
     way: list[list[float]] = field(default_factory=list)
     exits: list[TrueExit] = field(default_factory=list)
-    gaps: list[_Wall] = field(default_factory=list)
+    gaps: list[Wall] = field(default_factory=list)
     """Parts of walls at which nothing may stand: doors, and where there is no wall."""
     walkers: list[Walker] = field(default_factory=list)
 
@@ -76,7 +65,12 @@ def named_site(name: str, seed: int) -> Site:
     try:
         if file.start is None or len(file.way) < 1:
             raise ConfigError("start and way are missing: where a drone stands, and how it gets to its goal")
-        layout = _flyable(file, rng)
+        for _ in range(_TRIES):
+            layout = _laid_out(file, rng, {})
+            if connected(layout.scene, layout.way):
+                break
+        else:
+            raise ConfigError("nothing leaves a free way of 0.8 m from the start to the goal")
         world = layout.scene.world(file.name)
     except (ConfigError, ValueError, TypeError) as error:
         raise ConfigError(f"{name}: {error}") from error
@@ -89,11 +83,11 @@ def named_site(name: str, seed: int) -> Site:
     T_site_w[:2, 3] = x, y
     T_w_site = se3.inverse(T_site_w)
     goal = se3.transform(T_w_site, np.array([*layout.way[-1], GOAL_HEIGHT_M]))
-    exits = tuple(
-        TrueExit(T_w_site[:3, :3] @ e.centre_w + T_w_site[:3, 3], T_w_site[:3, :3] @ e.normal_w, e.width_m, e.height_m)
+    exits = [
+        replace(e, centre_w=T_w_site[:3, :3] @ e.centre_w + T_w_site[:3, 3], normal_w=T_w_site[:3, :3] @ e.normal_w)
         for e in layout.exits
-    )
-    return Site(file.name, seed, world, T_site_w, goal, exits, tuple(layout.walkers))
+    ]
+    return Site(file.name, seed, world, T_site_w, goal, tuple(exits), tuple(layout.walkers))
 
 
 def place(name: str, rng: Rng, **given: float) -> World:
@@ -103,15 +97,6 @@ def place(name: str, rng: Rng, **given: float) -> World:
         ConfigError: If there is no such scene or the file is wrong.
     """
     return _laid_out(read_scene(scene_path(name)), rng, given).scene.world(name)
-
-
-def _flyable(file: SceneFile, rng: Rng) -> _Layout:
-    """The first layout that leaves a way from the start to the goal."""
-    for _ in range(_TRIES):
-        layout = _laid_out(file, rng, {})
-        if connected(layout.scene, layout.way):
-            return layout
-    raise ConfigError("nothing leaves a free way of 0.8 m from the start to the goal")
 
 
 def _laid_out(file: SceneFile, rng: Rng, given: dict[str, float]) -> _Layout:
@@ -129,10 +114,8 @@ def _laid_out(file: SceneFile, rng: Rng, given: dict[str, float]) -> _Layout:
     _light(file, scene, rng, value, rooms)
     for a, b in _between(rooms, solid):
         block(scene, a, b, {face: random_paint(rng, file.walls) for face in "frbl"})
-    for part in _walls(file, rng, value, rooms, layout):
-        ends = np.full((2, 2), part.at)
-        ends[:, 1 - part.axis] = part.low, part.high
-        wall(scene, rng, ends, part.openings, file.walls)
+    for wall in _walls(file, rng, value, rooms, layout):
+        raise_wall(scene, rng, wall, file.walls)
     for rug in file.rug:
         dressing.rug(scene, rng, value(rug.x), value(rug.y))
     for dress in file.dress:
@@ -221,26 +204,26 @@ def _between(rooms: dict[str, FloatArray], solid: Sequence[FloatArray]) -> list[
     return out
 
 
-def _walls(file: SceneFile, rng: Rng, value: Values, rooms: dict[str, FloatArray], layout: _Layout) -> list[_Wall]:
+def _walls(file: SceneFile, rng: Rng, value: Values, rooms: dict[str, FloatArray], layout: _Layout) -> list[Wall]:
     """Walls between rooms that touch, those along one line as one, with the file's doors; the open ones are exits."""
-    shared: dict[frozenset[str], _Wall] = {}
+    shared: dict[frozenset[str], Wall] = {}
     for (a, r), (b, s) in combinations(rooms.items(), 2):
         for axis in (0, 1):
             low, high = max(r[0, 1 - axis], s[0, 1 - axis]), min(r[1, 1 - axis], s[1, 1 - axis])
             for first, second in ((r, s), (s, r)):
                 if high - low > _EPS_M and abs(first[1, axis] - second[0, axis]) < _EPS_M:
-                    shared[frozenset((a, b))] = _Wall(axis, first[1, axis], low, high)
+                    shared[frozenset((a, b))] = Wall(axis, first[1, axis], low, high)
     for pair in file.open:
         if (gap := shared.pop(frozenset(pair), None)) is None:
             raise ConfigError(f"open: rooms {pair[0]!r} and {pair[1]!r} do not touch")
         layout.gaps.append(gap)
-    walls: list[_Wall] = []
+    walls: list[Wall] = []
     for part in sorted(shared.values(), key=lambda w: (-w.axis, w.at, w.low)):
         last = walls[-1] if walls else None
         if last and (last.axis, last.at) == (part.axis, part.at) and abs(last.high - part.low) < _EPS_M:
             last.high = part.high
         else:
-            walls.append(_Wall(part.axis, part.at, part.low, part.high))
+            walls.append(replace(part))
     for door in file.door:
         value.define(door.values)
         edge = shared.get(frozenset(door.between))
@@ -257,7 +240,7 @@ def _walls(file: SceneFile, rng: Rng, value: Values, rooms: dict[str, FloatArray
                 raise ConfigError(f"{where}: overlaps another door")
         whole.openings = sorted([*whole.openings, Opening(at - whole.low, width, height, leaf)], key=lambda o: o.at_m)
         half = 0.5 * width + _BESIDE_M
-        layout.gaps.append(_Wall(edge.axis, edge.at, at - half, at + half))
+        layout.gaps.append(Wall(edge.axis, edge.at, at - half, at + half))
         if is_open:
             centre, normal = np.full(3, 0.5 * height), np.zeros(3)
             centre[edge.axis], centre[1 - edge.axis] = edge.at, at

@@ -17,9 +17,9 @@ def mirrored(world: World) -> World:
     a mirror sees. The copy's surfaces are named `REFLECTION`; the wall stays the world's bound.
     """
     wall = float(world.bounds_w[1, 0])
-    kept = [q for q in world.quads if (q.corners_w[:, 0] < wall - _ON_WALL_M).any()]
+    kept = [world.quads[k] for k in np.flatnonzero(world.corners_w[:, :, 0].min(1) < wall - _ON_WALL_M)]
     behind = [_reflected(q, wall) for q in kept]
-    return World([*kept, *behind], world.name, world.bounds_w, list(world.boxes), world.unseen)
+    return World([*kept, *behind], world.name, world.bounds_w, world.boxes, world.unseen)
 
 
 def _reflected(quad: Quad, wall: float) -> Quad:
@@ -27,5 +27,5 @@ def _reflected(quad: Quad, wall: float) -> Quad:
     flip = np.array([-1.0, 1.0, 1.0])
     origin = (quad.origin_w + quad.u_w) * flip
     origin[0] += 2.0 * wall
-    texture = Texture(lambda: quad.texture.image[:, ::-1])
+    texture = Texture(lambda: quad.texture.level(0)[:, ::-1])
     return Quad(origin, -quad.u_w * flip, quad.v_w * flip, texture, REFLECTION, quad.two_sided)

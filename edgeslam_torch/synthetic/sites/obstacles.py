@@ -7,6 +7,7 @@ from scipy import ndimage
 
 from edgeslam_torch.synthetic.house.pieces import build
 from edgeslam_torch.synthetic.house.scene import Place, Scene
+from edgeslam_torch.synthetic.house.world import in_parts, to_boxes
 
 Rng = np.random.Generator
 KINDS = ("column", "hanging_lamp", "table_and_chair", "pile", "lamp")
@@ -29,13 +30,13 @@ def stand_in_the_way(
         if added == count:
             return
         x, y = (float(v) for v in rng.uniform(low, high))
-        before = len(scene.surfaces), len(scene.boxes)
+        before = len(scene.quads), len(scene.boxes)
         kind = KINDS[int(rng.integers(len(KINDS)))]
         build(scene, Place(x, y, float(rng.uniform(-np.pi, np.pi))), rng, kind)
         if connected(scene, kept):
             added += 1
         else:
-            del scene.surfaces[before[0] :], scene.boxes[before[1] :]
+            del scene.quads[before[0] :], scene.boxes[before[1] :]
 
 
 def connected(scene: Scene, places: Sequence[Sequence[float]]) -> bool:
@@ -46,23 +47,15 @@ def connected(scene: Scene, places: Sequence[Sequence[float]]) -> bool:
         scene: The solids.
         places: x and y of each [m].
     """
-    parts, _ = ndimage.label(_free(scene))
-    cells = [tuple(np.floor((np.array(p) - scene.low_w[:2]) / _GRID_M).astype(int)) for p in places]
-    column = np.array([[*places[0], z] for z in np.arange(0.0, 1.0, 0.1)])
-    stands = all((box.distance(column) > PASSAGE_M).all() for box in (*scene.boxes, *scene.unseen))
-    found = {int(parts[cell]) for cell in cells}
-    return stands and len(found) == 1 and 0 not in found
-
-
-def _free(scene: Scene) -> np.ndarray:
-    """Cells of the floor above which a drone can fly, ``(X, Y)`` bool."""
     low, high = scene.low_w[:2], scene.high_w[:2]
-    count = np.ceil((high - low) / _GRID_M).astype(int)
-    x, y = (low[k] + (np.arange(count[k]) + 0.5) * _GRID_M for k in (0, 1))
+    to_solid = to_boxes([*scene.boxes, *scene.unseen])
+    x, y = (low[k] + (np.arange(np.ceil((high - low)[k] / _GRID_M)) + 0.5) * _GRID_M for k in (0, 1))
     grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     free = np.minimum(grid - low, high - grid).min(-1) > PASSAGE_M
     for z in (0.8, 1.1, 1.4):
-        p = np.concatenate([grid, np.full((*grid.shape[:2], 1), z)], axis=-1)
-        for box in (*scene.boxes, *scene.unseen):
-            free &= box.distance(p) > PASSAGE_M
-    return free
+        p = np.insert(grid, 2, z, axis=-1)
+        free &= in_parts(to_solid, p.reshape(-1, 3)).reshape(free.shape) > PASSAGE_M
+    parts, _ = ndimage.label(free)
+    found = {int(parts[tuple(np.floor((np.array(p) - low) / _GRID_M).astype(int))]) for p in places}
+    column = np.array([[*places[0], z] for z in np.arange(0.0, 1.0, 0.1)])
+    return bool((to_solid(column) > PASSAGE_M).all()) and len(found) == 1 and 0 not in found

@@ -6,7 +6,7 @@ import numpy as np
 
 from edgeslam_torch.synthetic.house.pieces import build
 from edgeslam_torch.synthetic.house.scene import Place, Scene
-from edgeslam_torch.synthetic.house.world import Box, Quad
+from edgeslam_torch.synthetic.house.world import Box, Quad, to_boxes
 from edgeslam_torch.types import FloatArray
 
 Rng = np.random.Generator
@@ -50,7 +50,7 @@ class Walker:
         local = np.array(p_w, dtype=np.float64)
         dx, dy = local[:, 0] - x, local[:, 1] - y
         local[:, 0], local[:, 1] = c * dx + s * dy, c * dy - s * dx
-        return np.min([box.distance(local) for box in self.boxes], axis=0)
+        return to_boxes(self.boxes)(local)
 
 
 def walker(rng: Rng, ends_w: FloatArray, speed_m_s: float) -> Walker:

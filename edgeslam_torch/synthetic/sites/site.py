@@ -54,7 +54,8 @@ class Site:
     def painted(self, clock_s: float) -> World:
         """What a camera sees at a time."""
         people = [quad for walker in self.walkers for quad in walker.painted(clock_s)]
-        return self.world.with_quads(people) if people else self.world
+        still = self.world
+        return World([*still.quads, *people], still.name, still.bounds_w, still.boxes) if people else still
 
     def in_site(self, p_w: FloatArray) -> FloatArray:
         """Points ``(..., 3)`` of the drone's own world in the site's axes."""

@@ -18,14 +18,14 @@ def plaster(rng: Rng) -> np.ndarray:
     """Painted wall, weak texture."""
     base = colour(rng, (0.0, 0.25), (0.6, 0.95))
     strength = rng.uniform(0.008, 0.03)
-    field = 1 + strength * fractal(rng, (TILE_PX, TILE_PX), 0.8) + strength * fractal(rng, (TILE_PX, TILE_PX), 0.2)
+    field = 1 + strength * fractal(rng, 0.8) + strength * fractal(rng, 0.2)
     return shaded(base, field)
 
 
 def rough_plaster(rng: Rng) -> np.ndarray:
     """Render with visible grain, lit from one side."""
     base = colour(rng, (0.0, 0.3), (0.5, 0.9))
-    height = fractal(rng, (TILE_PX, TILE_PX), rng.uniform(0.6, 1.2))
+    height = fractal(rng, rng.uniform(0.6, 1.2))
     slope = height - np.roll(height, (1, 1), (0, 1))
     return shaded(base, 1 + rng.uniform(0.04, 0.12) * slope + 0.03 * height)
 
@@ -33,7 +33,7 @@ def rough_plaster(rng: Rng) -> np.ndarray:
 def concrete(rng: Rng) -> np.ndarray:
     """Stained concrete with pores."""
     base = colour(rng, (0.0, 0.1), (0.4, 0.7))
-    field = 1 + 0.09 * fractal(rng, (TILE_PX, TILE_PX), 1.4) + 0.04 * fractal(rng, (TILE_PX, TILE_PX), 0.3)
+    field = 1 + 0.09 * fractal(rng, 1.4) + 0.04 * fractal(rng, 0.3)
     image = shaded(base, field)
     for _ in range(60):
         centre = rng.integers(0, TILE_PX, 2).tolist()
@@ -44,7 +44,7 @@ def concrete(rng: Rng) -> np.ndarray:
 def wallpaper(rng: Rng) -> np.ndarray:
     """A mirrored motif repeated in a half-drop grid, or stripes."""
     size = int(rng.choice([56, 112, 224]))
-    half = fractal(rng, (size, size // 2), rng.uniform(1.2, 1.8))
+    half = fractal(rng, rng.uniform(1.2, 1.8), (size, size // 2))
     motif = np.hstack([half, half[:, ::-1]])
     mask = cv2.GaussianBlur((motif > rng.uniform(0.2, 0.8)).astype(np.float32), (0, 0), 0.8)
     tile = np.tile(mask, (TILE_PX // size, TILE_PX // size))
@@ -54,7 +54,7 @@ def wallpaper(rng: Rng) -> np.ndarray:
     a = colour(rng, (0.05, 0.45), (0.5, 0.9))
     b = np.clip(a * rng.uniform(0.6, 1.25) + rng.normal(0, 12, 3), 0, 255)
     image = a + (b - a) * tile[..., None]
-    return shaded(image, 1 + 0.02 * fractal(rng, (TILE_PX, TILE_PX), 0.4))
+    return shaded(image, 1 + 0.02 * fractal(rng, 0.4))
 
 
 def wood(rng: Rng) -> np.ndarray:
@@ -62,10 +62,10 @@ def wood(rng: Rng) -> np.ndarray:
     tone = timber(rng)
     planks = int(rng.choice([4, 7, 8, 14]))
     width = TILE_PX // planks
-    grain = fractal(rng, (TILE_PX, TILE_PX), 1.0, stretch=14.0)
-    wave = fractal(rng, (TILE_PX, TILE_PX), 1.8, stretch=5.0)
+    grain = fractal(rng, 1.0, stretch=14.0)
+    wave = fractal(rng, 1.8, stretch=5.0)
     rings = np.sin(6.28 * (rng.uniform(1.5, 4.0) * wave + 0.3 * grain))
-    field = 1 + 0.06 * grain + 0.07 * rings + 0.02 * fractal(rng, (TILE_PX, TILE_PX), 0.1)
+    field = 1 + 0.06 * grain + 0.07 * rings + 0.02 * fractal(rng, 0.1)
     for i in range(planks):
         rows = slice(i * width, (i + 1) * width)
         field[rows] = np.roll(field[rows], int(rng.integers(0, TILE_PX)), axis=1) * rng.uniform(0.85, 1.12)
@@ -78,32 +78,26 @@ def wood(rng: Rng) -> np.ndarray:
 def veneer(rng: Rng) -> np.ndarray:
     """Continuous wood surface of furniture."""
     tone = timber(rng)
-    grain = fractal(rng, (TILE_PX, TILE_PX), 1.0, stretch=20.0)
-    wave = fractal(rng, (TILE_PX, TILE_PX), 1.9, stretch=6.0)
+    grain = fractal(rng, 1.0, stretch=20.0)
+    wave = fractal(rng, 1.9, stretch=6.0)
     field = 1 + 0.07 * grain + 0.06 * np.sin(6.28 * (rng.uniform(1, 3) * wave + 0.2 * grain))
     return shaded(tone, field)
 
 
 def bricks(rng: Rng) -> np.ndarray:
     """Running bond with mortar."""
-    rows = 16
-    columns = 8
+    rows, columns = 16, 8
     h, w = TILE_PX // rows, TILE_PX // columns
-    tone = (
-        colour(rng, (0.3, 0.6), (0.4, 0.7))
-        if rng.random() < 0.3
-        else np.array([60.0, 75.0, 150.0]) * rng.uniform(0.6, 1.2)
-    )
+    plain = rng.random() < 0.3
+    tone = colour(rng, (0.3, 0.6), (0.4, 0.7)) if plain else np.array([60.0, 75.0, 150.0]) * rng.uniform(0.6, 1.2)
     mortar = colour(rng, (0.0, 0.1), (0.5, 0.8))
     image = np.empty((TILE_PX, TILE_PX, 3), np.float32)
-    image[:] = mortar
     for r in range(rows):
-        band = np.empty((h, TILE_PX, 3), np.float32)
-        band[:] = mortar
+        band = np.tile(mortar.astype(np.float32), (h, TILE_PX, 1))
         for c in range(columns):
             band[2:, c * w + 2 : (c + 1) * w] = tone * rng.uniform(0.75, 1.2) + rng.normal(0, 6, 3)
         image[r * h : (r + 1) * h] = np.roll(band, (r % 2) * w // 2, axis=1)
-    field = 1 + 0.08 * fractal(rng, (TILE_PX, TILE_PX), 0.6) + 0.04 * fractal(rng, (TILE_PX, TILE_PX), 0.1)
+    field = 1 + 0.08 * fractal(rng, 0.6) + 0.04 * fractal(rng, 0.1)
     return shaded(np.asarray(cv2.GaussianBlur(image, (0, 0), 0.6)), field)
 
 
@@ -114,7 +108,7 @@ def tiles(rng: Rng) -> np.ndarray:
     a = colour(rng, (0.0, 0.35), (0.45, 0.95))
     b = a * rng.uniform(0.45, 0.8) if rng.random() < 0.4 else a
     image = np.empty((TILE_PX, TILE_PX, 3), np.float32)
-    marble = fractal(rng, (TILE_PX, TILE_PX), 1.5)
+    marble = fractal(rng, 1.5)
     veins = np.exp(-((marble / 0.08) ** 2)) * rng.uniform(0.0, 0.25)
     for r in range(n):
         for c in range(n):
@@ -125,14 +119,14 @@ def tiles(rng: Rng) -> np.ndarray:
     for k in range(n):
         image[k * side : k * side + 2] = grout
         image[:, k * side : k * side + 2] = grout
-    return shaded(image, 1 + 0.02 * fractal(rng, (TILE_PX, TILE_PX), 0.2))
+    return shaded(image, 1 + 0.02 * fractal(rng, 0.2))
 
 
 def carpet(rng: Rng) -> np.ndarray:
     """Short pile: strong fine noise, sometimes in squares."""
     base = colour(rng, (0.0, 0.5), (0.2, 0.65))
-    field = 1 + rng.uniform(0.1, 0.25) * cv2.GaussianBlur(fractal(rng, (TILE_PX, TILE_PX), 0.1), (0, 0), 0.7)
-    field += 0.06 * fractal(rng, (TILE_PX, TILE_PX), 1.0)
+    field = 1 + rng.uniform(0.1, 0.25) * cv2.GaussianBlur(fractal(rng, 0.1), (0, 0), 0.7)
+    field += 0.06 * fractal(rng, 1.0)
     if rng.random() < 0.4:
         n = int(rng.choice([4, 8]))
         field *= np.kron(rng.uniform(0.85, 1.1, (n, n)), np.ones((TILE_PX // n, TILE_PX // n)))
@@ -144,7 +138,7 @@ def fabric(rng: Rng) -> np.ndarray:
     y, x = np.mgrid[0:TILE_PX, 0:TILE_PX]
     period = float(rng.choice([4, 7, 8]))
     field = 1 + 0.08 * np.sin(6.2832 * x / period) * np.sin(6.2832 * y / period)
-    field = field + 0.05 * fractal(rng, (TILE_PX, TILE_PX), 0.5)
+    field = field + 0.05 * fractal(rng, 0.5)
     image = np.empty((TILE_PX, TILE_PX, 3), np.float32)
     image[:] = colour(rng, (0.1, 0.7), (0.25, 0.8))
     kind = rng.random()
@@ -163,21 +157,17 @@ def fabric(rng: Rng) -> np.ndarray:
 def metal(rng: Rng) -> np.ndarray:
     """Brushed or painted metal."""
     base = colour(rng, (0.0, 0.2), (0.35, 0.85))
-    field = 1 + rng.uniform(0.01, 0.05) * fractal(rng, (TILE_PX, TILE_PX), 0.4, stretch=30.0)
-    return shaded(base, field + 0.02 * fractal(rng, (TILE_PX, TILE_PX), 1.3))
+    field = 1 + rng.uniform(0.01, 0.05) * fractal(rng, 0.4, stretch=30.0)
+    return shaded(base, field + 0.02 * fractal(rng, 1.3))
 
 
 def terrazzo(rng: Rng) -> np.ndarray:
     """Chips in cement."""
-    image = shaded(colour(rng, (0.0, 0.15), (0.5, 0.85)), 1 + 0.03 * fractal(rng, (TILE_PX, TILE_PX), 0.5))
+    image = shaded(colour(rng, (0.0, 0.15), (0.5, 0.85)), 1 + 0.03 * fractal(rng, 0.5))
     for _ in range(int(rng.integers(500, 1600))):
-        x, y = rng.integers(6, TILE_PX - 6, 2)
-        points = np.array([x, y]) + rng.normal(0, rng.uniform(1.0, 4.0), (5, 2))
-        cv2.fillConvexPoly(
-            image,
-            cv2.convexHull(points.astype(np.float32)).astype(np.int32),
-            colour(rng, (0, 0.4), (0.2, 0.95)).tolist(),
-        )
+        points = rng.integers(6, TILE_PX - 6, 2) + rng.normal(0, rng.uniform(1.0, 4.0), (5, 2))
+        chip = cv2.convexHull(points.astype(np.float32)).astype(np.int32)
+        cv2.fillConvexPoly(image, chip, colour(rng, (0, 0.4), (0.2, 0.95)).tolist())
     return image
 
 
@@ -198,7 +188,7 @@ def dead_leaves(rng: Rng, shape: tuple[int, int] = (TILE_PX, TILE_PX), count: in
             half = np.array([radius, radius * rng.uniform(0.25, 1)])
             box = _turned_box(centre, half, np.deg2rad(rng.uniform(0, 90)))
             cv2.fillConvexPoly(image, box, tone.tolist(), cv2.LINE_AA)
-    return shaded(image.astype(np.float32), 1 + 0.05 * fractal(rng, shape, 1.0))
+    return shaded(image.astype(np.float32), 1 + 0.05 * fractal(rng, 1.0, shape))
 
 
 def _turned_box(centre: tuple[int, int], half: FloatArray, turn_rad: float) -> np.ndarray:
@@ -211,7 +201,7 @@ def _turned_box(centre: tuple[int, int], half: FloatArray, turn_rad: float) -> n
 def ceiling_panels(rng: Rng) -> np.ndarray:
     """Suspended ceiling: perforated or flecked panels in a grid, tileable."""
     base = colour(rng, (0.0, 0.06), (0.75, 0.95))
-    image = shaded(base, 1 + 0.02 * fractal(rng, (TILE_PX, TILE_PX), 0.3)).astype(np.float32)
+    image = shaded(base, 1 + 0.02 * fractal(rng, 0.3)).astype(np.float32)
     flecks = rng.random((TILE_PX, TILE_PX)) < 0.01
     image[flecks] *= 0.7
     image = np.asarray(cv2.GaussianBlur(image, (0, 0), 0.6))
@@ -226,24 +216,15 @@ def ceiling_panels(rng: Rng) -> np.ndarray:
 
 
 MATERIALS: dict[str, Callable[[Rng], np.ndarray]] = {
-    "plaster": plaster,
-    "rough_plaster": rough_plaster,
-    "concrete": concrete,
-    "wallpaper": wallpaper,
-    "wood": wood,
-    "veneer": veneer,
-    "bricks": bricks,
-    "tiles": tiles,
-    "carpet": carpet,
-    "fabric": fabric,
-    "metal": metal,
-    "terrazzo": terrazzo,
-    "dead_leaves": dead_leaves,
-    "ceiling_panels": ceiling_panels,
-}
+    draw.__name__: draw
+    for draw in (
+        plaster, rough_plaster, concrete, wallpaper, wood, veneer, bricks, tiles, carpet, fabric, metal, terrazzo,
+        dead_leaves, ceiling_panels,
+    )
+}  # fmt: skip
 
 
-def fractal(rng: Rng, shape: tuple[int, int], beta: float = 1.0, stretch: float = 1.0) -> FloatArray:
+def fractal(rng: Rng, beta: float, shape: tuple[int, int] = (TILE_PX, TILE_PX), stretch: float = 1.0) -> FloatArray:
     """Tileable 1/f**beta noise, zero mean and unit deviation, float32; ``stretch`` > 1 draws it out along x."""
     h, w = shape
     fy, fx = np.fft.fftfreq(h)[:, None] * h, np.fft.rfftfreq(w)[None] * w

@@ -11,8 +11,9 @@ WORDS = (
     "STUDY", "WORLD", "SIGNAL", "MAP", "TODAY", "CITY", "SUMMER", "GARDEN", "SCIENCE", "MUSIC", "ATLAS",
     "HISTORY", "OPEN", "DESIGN", "ENERGY", "NUMBER", "THEORY", "WINTER", "VECTOR", "RIVER",
 )  # fmt: skip
-_FONTS = ("SIMPLEX", "DUPLEX", "COMPLEX", "TRIPLEX", "SCRIPT_SIMPLEX")
-FONTS = tuple(getattr(cv2, f"FONT_HERSHEY_{name}") for name in _FONTS)
+FONTS = tuple(
+    getattr(cv2, f"FONT_HERSHEY_{name}") for name in ("SIMPLEX", "DUPLEX", "COMPLEX", "TRIPLEX", "SCRIPT_SIMPLEX")
+)
 
 
 def landscape(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
@@ -22,7 +23,7 @@ def landscape(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
     bottom = colour(rng, (0.0, 0.2), (0.9, 1.0))
     ramp = np.linspace(0, 1, h, dtype=np.float32)[:, None, None]
     image = np.broadcast_to(top + (bottom - top) * ramp, (h, w, 3)).copy()
-    clouds = np.clip(fractal(rng, shape, 1.6, stretch=2.0) * 0.3, 0, 0.6)[..., None]
+    clouds = np.clip(fractal(rng, 1.6, shape, stretch=2.0) * 0.3, 0, 0.6)[..., None]
     image += (255 - image) * clouds
     rows = np.arange(h)[:, None]
     level = rng.uniform(0.3, 0.55)
@@ -30,8 +31,7 @@ def landscape(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
         line = h * (level + 0.06 * np.cumsum(rng.normal(0, 1, w)) / np.sqrt(w))
         tone = colour(rng, (0.2, 0.6), (0.15, 0.6)) * np.array([0.7, 1.1, 0.8])
         ground = rows > line[None]
-        texture = (tone * (1 + 0.25 * fractal(rng, shape, 0.8))[..., None])[ground]
-        image[ground] = texture
+        image[ground] = (tone * (1 + 0.25 * fractal(rng, 0.8, shape))[..., None])[ground]
         level += rng.uniform(0.08, 0.2)
     return np.clip(image, 0, 255).astype(np.uint8)
 
@@ -53,8 +53,7 @@ def poster(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
     """Printed poster, picture or notice, with a border."""
     h, w = shape
     paper = colour(rng, (0.0, 0.6), (0.55, 1.0))
-    image = np.empty((h, w, 3), np.uint8)
-    image[:] = paper.astype(np.uint8)
+    image = np.tile(paper.astype(np.uint8), (h, w, 1))
     ink = (colour(rng, (0.0, 0.9), (0.0, 0.35)) if paper.mean() > 120 else np.full(3, 235.0)).tolist()
     kind = rng.random()
     m = max(4, min(h, w) // 16)
@@ -157,10 +156,9 @@ def _finish(rng: Rng, shape: tuple[int, int]) -> FloatArray:
         tile = veneer(rng)
         if h > w:
             tile = cv2.rotate(tile, cv2.ROTATE_90_CLOCKWISE)
-        reps = (h // TILE_PX + 1, w // TILE_PX + 1, 1)
-        return np.tile(tile, reps)[:h, :w].astype(np.float32)
+        return np.tile(tile, (h // TILE_PX + 1, w // TILE_PX + 1, 1))[:h, :w].astype(np.float32)
     base = colour(rng, (0.0, 0.5), (0.35, 0.95))
-    return base * (1 + 0.015 * fractal(rng, shape, 0.6))[..., None]
+    return base * (1 + 0.015 * fractal(rng, 0.6, shape))[..., None]
 
 
 def door(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
@@ -171,8 +169,8 @@ def door(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
     kind = rng.random()
     if kind < 0.6:
         rows = int(rng.integers(1, 4))
+        height = (h - m * (rows + 1)) // rows
         for r in range(rows):
-            height = (h - m * (rows + 1)) // rows
             for c in range(2 if rng.random() < 0.5 else 1):
                 columns = 2 if c or rows > 2 else 1
                 width = (w - m * (columns + 1)) // columns
@@ -185,16 +183,8 @@ def door(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
     image = np.clip(image, 0, 255).astype(np.uint8)
     if rng.random() < 0.6:
         cv2.rectangle(image, (w // 3, h // 6), (w // 3 + w // 4, h // 6 + w // 10), (235, 235, 235), -1)
-        cv2.putText(
-            image,
-            f"{rng.integers(100, 400)}",
-            (w // 3 + 3, h // 6 + w // 12),
-            FONTS[1],
-            w / 420,
-            (40, 40, 40),
-            1,
-            cv2.LINE_AA,
-        )
+        number, at = f"{rng.integers(100, 400)}", (w // 3 + 3, h // 6 + w // 12)
+        cv2.putText(image, number, at, FONTS[1], w / 420, (40, 40, 40), 1, cv2.LINE_AA)
     x, y = int(0.9 * w), int(0.53 * h)
     cv2.rectangle(image, (x - w // 40, y - h // 30), (x + w // 40, y + h // 20), (150, 155, 160), -1, cv2.LINE_AA)
     cv2.line(image, (x, y), (x - w // 8, y), (195, 200, 205), max(3, h // 110), cv2.LINE_AA)
@@ -229,8 +219,7 @@ def cabinet(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
 def window(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
     """Bright view behind panes."""
     h, w = shape
-    outside = landscape(rng, shape).astype(np.float32)
-    image = np.clip(outside * rng.uniform(0.8, 1.5) + 30, 0, 255).astype(np.uint8)
+    image = np.clip(landscape(rng, shape).astype(np.float32) * rng.uniform(0.8, 1.5) + 30, 0, 255).astype(np.uint8)
     columns, rows = int(rng.integers(1, 4)), int(rng.integers(1, 3))
     bar = colour(rng, (0.0, 0.15), (0.6, 0.95)).tolist()
     thick = max(4, min(h, w) // 24)
@@ -248,12 +237,10 @@ def whiteboard(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
     """Scribbles on white, or papers pinned on cork."""
     h, w = shape
     if rng.random() < 0.5:
-        base = np.array([235.0, 238.0, 236.0])
-        image = shaded(base, 1 + 0.01 * fractal(rng, shape, 1.5))
+        inks = [[160.0, 60.0, 30.0], [40.0, 40.0, 190.0], [40.0, 40.0, 40.0], [60.0, 130.0, 30.0]]
+        image = shaded(np.array([235.0, 238.0, 236.0]), 1 + 0.01 * fractal(rng, 1.5, shape))
         for _ in range(int(rng.integers(3, 8))):
-            ink = [[160.0, 60.0, 30.0], [40.0, 40.0, 190.0], [40.0, 40.0, 40.0], [60.0, 130.0, 30.0]][
-                int(rng.integers(4))
-            ]
+            ink = inks[int(rng.integers(4))]
             x, y = int(rng.uniform(0.03, 0.6) * w), int(rng.uniform(0.0, 0.7) * h)
             if rng.random() < 0.6:
                 _text_block(rng, image, x, y, int(0.35 * w), int(rng.integers(1, 5)), h / 500, ink)
@@ -261,7 +248,7 @@ def whiteboard(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
                 points = np.cumsum(rng.normal(0, 0.05 * h, (12, 2)), axis=0) + [x + 0.1 * w, y + 0.1 * h]
                 cv2.polylines(image, [points.astype(np.int32)], bool(rng.random() < 0.3), ink, 2, cv2.LINE_AA)
     else:
-        image = shaded(np.array([90.0, 140.0, 185.0]), 1 + 0.12 * fractal(rng, shape, 0.4))
+        image = shaded(np.array([90.0, 140.0, 185.0]), 1 + 0.12 * fractal(rng, 0.4, shape))
         for _ in range(int(rng.integers(5, 14))):
             ph, pw = int(rng.uniform(0.15, 0.4) * h), int(rng.uniform(0.08, 0.2) * w)
             x, y = int(rng.uniform(0, max(1, w - pw))), int(rng.uniform(0, max(1, h - ph)))
@@ -284,22 +271,15 @@ def radiator(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
 def keyboard(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
     """Rows of keys."""
     h, w = shape
-    dark = rng.random() < 0.6
-    image = np.full((h, w, 3), 25 if dark else 205, np.uint8)
+    ground, key, ink = (25, (60,) * 3, (180,) * 3) if rng.random() < 0.6 else (205, (240,) * 3, (60,) * 3)
+    image = np.full((h, w, 3), ground, np.uint8)
     for r in range(5):
         x = 3
         while x < w - 6:
             width = int(rng.choice([1, 1, 1, 1, 1.6]) * w / 17)
             y0, y1 = 3 + r * (h - 6) // 5, (r + 1) * (h - 6) // 5
-            cv2.rectangle(image, (x, y0), (min(x + width - 2, w - 4), y1), (60,) * 3 if dark else (240,) * 3, -1)
-            cv2.putText(
-                image,
-                chr(65 + int(rng.integers(26))),
-                (x + 2, y1 - 3),
-                FONTS[0],
-                0.3,
-                (180,) * 3 if dark else (60,) * 3,
-            )
+            cv2.rectangle(image, (x, y0), (min(x + width - 2, w - 4), y1), key, -1)
+            cv2.putText(image, chr(65 + int(rng.integers(26))), (x + 2, y1 - 3), FONTS[0], 0.3, ink)
             x += width
     return image
 
@@ -311,8 +291,6 @@ def rug(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
     image = np.hstack([quarter, quarter[:, ::-1]])
     image = np.vstack([image, image[::-1]])[:h, :w].copy()
     for k in range(3):
-        inset = int((k + 0.4) * min(h, w) * 0.05)
-        cv2.rectangle(
-            image, (inset, inset), (w - 1 - inset, h - 1 - inset), colour(rng, (0.2, 0.8), (0.2, 0.9)).tolist(), 4
-        )
-    return shaded(image.astype(np.float32), 1 + 0.12 * fractal(rng, shape, 0.2))
+        inset, tone = int((k + 0.4) * min(h, w) * 0.05), colour(rng, (0.2, 0.8), (0.2, 0.9)).tolist()
+        cv2.rectangle(image, (inset, inset), (w - 1 - inset, h - 1 - inset), tone, 4)
+    return shaded(image.astype(np.float32), 1 + 0.12 * fractal(rng, 0.2, shape))

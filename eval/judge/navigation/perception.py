@@ -13,7 +13,7 @@ from edgeslam_torch.flying.perception import slam_perception
 from edgeslam_torch.geometry.camera import PRESETS, Camera
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.drone_state import DroneState, View
-from edgeslam_torch.synthetic.house.render import depth_map
+from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.sites.site import Site
 
 DEPTH_SIZE, IMAGE_SIZE = (160, 120), (480, 360)
@@ -92,7 +92,7 @@ class TruePerception:
     def _view(self, picture: Picture) -> View:
         camera, scale = PRESETS["tello"].scaled(*DEPTH_SIZE), self._conditions.scale
         T_w_c = picture.T_w_b @ camera_on_body()
-        depth = depth_map(self._site.painted(picture.captured_s), camera, self._site.T_site_w @ T_w_c)
+        depth = render(self._site.painted(picture.captured_s), camera, self._site.T_site_w @ T_w_c).depth_m
         T_w_c[:3, 3] /= scale
         sigma = np.full(depth.shape, _SIGMA_LOG, np.float32)
         return View(picture.captured_s, depth / scale, sigma, camera.K, T_w_c)

@@ -6,27 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch import demo
-from edgeslam_torch.readers.source import open_source
-from edgeslam_torch.synthetic.flights.courses import BLOCK_M, COURSES, LOW_LIGHT, RATE_HZ, simulated_camera
-from edgeslam_torch.synthetic.flights.degrade import degraded
+from edgeslam_torch.synthetic.flights.courses import BLOCK_M, COURSES, RATE_HZ
 from edgeslam_torch.synthetic.flights.flight import FlightPlan
-from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.sites.build import place
 
-
-@cache
-def built(scene):
-    """A world and the state of its random numbers: most courses fly through the same room."""
-    rng = np.random.default_rng(1)
-    return place(scene, rng), rng.bit_generator.state
+built = cache(lambda scene: place(scene, np.random.default_rng(1)))
+"""Most courses fly through the same room."""
 
 
 @cache
 def flight_of(name):
-    course, rng = COURSES[name], np.random.default_rng()
-    world, rng.bit_generator.state = built(course.scene)
-    return world, course.fly(rng, world, round(course.seconds * course.rate_hz))
+    course = COURSES[name]
+    world = built(course.scene)
+    return world, course.fly(np.random.default_rng(1), world, round(course.seconds * course.rate_hz))
 
 
 def turned_deg(flight):
@@ -51,7 +43,6 @@ def test_course_keeps_clear_of_walls_and_furniture(name):
 def test_block_is_flown_once_around_and_the_beginning_again():
     world, flight = flight_of("block")
     p = flight.T_w_b[:, :3, 3]
-    assert world.clearance(p).min() > 0.3
     yaw = np.unwrap(np.arctan2(flight.T_w_c[:, 1, 2], flight.T_w_c[:, 0, 2]))
     assert np.degrees(yaw[-1] - yaw[0]) == pytest.approx(360.0, abs=20.0), "the wall of the block is always at the left"
     assert path_m(flight) == pytest.approx(45.0, abs=1.0)
@@ -83,38 +74,15 @@ def test_first_second_goes_nowhere_and_the_rest_is_a_flight(name, min_deg, max_d
     p = flight.T_w_b[:, :3, 3]
     assert np.ptp(p[: second + 1], axis=0).max() < 0.03
     assert min_deg <= turned_deg(flight)[:second].sum() <= max_deg
-    assert np.linalg.norm(p[-1] - p[0]) > 3.0
     assert path_m(flight) > 6.0
-
-
-@pytest.mark.slow
-def test_a_flight_with_an_imu_is_read_with_its_mount(tmp_path):
-    settings = demo.DemoSettings("corridor", seconds=1.0, rate_hz=8.0, seed=4, width=80, height=60, imu=True)
-    flight = demo.record(tmp_path / "demo", settings).flight
-    source = open_source(tmp_path / "demo")
-    assert source.imu.T_imu_cam == pytest.approx(flight.T_b_c) and source.imu.time_offset_s == 0.0
-    assert source.imu.rate_hz == pytest.approx(200) and len(source.imu_readings) == 175
-    force_w = source.imu_readings.acceleration_m_s2.mean(axis=0) @ flight.T_w_b[:, :3, :3].mean(axis=0).T
-    assert force_w == pytest.approx([0.0, 0.0, 9.81], abs=1.0)
 
 
 def test_a_flight_along_a_rectangle_turns_at_its_corners():
     _, flight = flight_of("block")
-    p = flight.T_w_b[:, :2, 3]
-    outer = np.abs(p) - 0.5 * np.array(BLOCK_M)
+    outer = np.abs(flight.T_w_b[:, :2, 3]) - 0.5 * np.array(BLOCK_M)
     assert np.abs(outer.max(axis=1)).max() < 0.5, "on one side or the other"
     heading = np.arctan2(flight.T_w_b[:, 1, 0], flight.T_w_b[:, 0, 0])
     way = np.arctan2(flight.velocity_w[:, 1], flight.velocity_w[:, 0])
     fast = np.linalg.norm(flight.velocity_w[:, :2], axis=1) > 0.3
     off = np.abs((heading - way + np.pi) % (2 * np.pi) - np.pi)[fast]
     assert np.degrees(np.percentile(off, 95)) < 35.0, "it looks where it flies"
-
-
-@pytest.mark.slow
-def test_low_light_is_dark_and_noisy(rng):
-    world, flight = flight_of("low_light")
-    view = render(world, simulated_camera(160, 120), flight.T_w_c[0])
-    day = degraded(rng, view.image, view.depth_m, simulated_camera(160, 120), COURSES["room"].faults)
-    night = degraded(rng, view.image, view.depth_m, simulated_camera(160, 120), LOW_LIGHT)
-    assert night.mean() == pytest.approx(0.2 * day.mean(), rel=0.1)
-    assert night.max() < 70

@@ -53,10 +53,8 @@ def test_a_drone_leans_against_a_steady_wind():
     assert (lean == lean[0]).all()
 
 
-def test_a_windy_course_keeps_clear_and_leans():
-    world, flight, _ = flown(COURSES["windy_blank_corridor"], 0)
-    assert world.clearance(flight.T_w_b[:, :3, 3]).min() > 0.2
-    _, still, _ = flown(COURSES["blank_corridor"], 0)
+def test_a_windy_course_is_blown_aside_and_leans():
+    flight, still = (flown(COURSES[name], 0)[1] for name in ("windy_blank_corridor", "blank_corridor"))
     moved = flight.T_w_b[:, :3, 3] - still.T_w_b[:, :3, 3]
     assert 0.02 < moved[:, :2].std() < 0.3
     up = flight.T_w_b[:, :3, :3].mean(0)[:2, 2] - still.T_w_b[:, :3, :3].mean(0)[:2, 2]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.synthetic.house.pieces import build, furniture, stand
+from edgeslam_torch.synthetic.house.pieces import build, drawn, furniture, stand
 from edgeslam_torch.synthetic.house.scene import Place, Scene
 
 CHAIR_M = 0.55
@@ -17,22 +17,22 @@ def scene():
 def corners(built):
     """Corners of all surfaces ``(N, 3)``."""
     return np.concatenate(
-        [[s.origin_w, s.origin_w + s.u_w, s.origin_w + s.v_w, s.origin_w + s.u_w + s.v_w] for s in built.surfaces]
+        [[s.origin_w, s.origin_w + s.u_w, s.origin_w + s.v_w, s.origin_w + s.u_w + s.v_w] for s in built.quads]
     )
 
 
 @pytest.mark.parametrize("name", furniture())
 def test_furniture_stands_on_the_floor_that_it_takes(name):
-    piece = furniture()[name]
+    front = furniture()[name].get("front", 0.0)
     for seed in range(6):
         rng, built = np.random.default_rng(seed), scene()
-        width, depth = rng.uniform(*piece.width_m), rng.uniform(*piece.depth_m)
+        width, depth = drawn(rng, name)
         stand(built, Place(0.0, 0.0, 0.0), rng, name, width, depth)
-        built.surfaces = [s for s in built.surfaces if not s.two_sided]  # leaves
+        built.quads = [s for s in built.quads if not s.two_sided]  # leaves
         low, high = corners(built).min(0), corners(built).max(0)
         room = 0.25  # things that lie obliquely near the border of a top
         assert low[0] > -width / 2 - room and high[0] < width / 2 + room
-        assert low[1] > -room and high[1] < depth + piece.front_m + room + (CHAIR_M if piece.front_m else 0.0)
+        assert low[1] > -room and high[1] < depth + front + room + (CHAIR_M if front else 0.0)
         assert -1e-9 < low[2] < 0.3 and high[2] < 2.6
         assert len(built.boxes) > 0
 
@@ -41,11 +41,12 @@ def test_furniture_stands_on_the_floor_that_it_takes(name):
 def test_a_piece_is_turned_and_moved_as_a_whole(name):
     here, there = Place(0.0, 0.0, 0.0), Place(1.0, -0.5, 0.7, 0.1)
     one, other = scene(), scene()
-    for built, place in ((one, here), (other, there)):
-        stand(built, place, np.random.default_rng(3), name, 1.0, 0.6)
+    rngs = [np.random.default_rng(3) for _ in range(2)]
+    for built, place, rng in zip((one, other), (here, there), rngs, strict=True):
+        stand(built, place, rng, name, 1.0, 0.6)
     moved = np.array([there.point(p) for p in corners(one)])
     np.testing.assert_allclose(corners(other), moved, atol=1e-9)
-    assert [s.paint for s in one.surfaces] == [s.paint for s in other.surfaces]
+    assert rngs[0].random() == rngs[1].random(), "painted alike"
 
 
 def test_a_pile_of_books_stays_below_the_next_board():
@@ -59,5 +60,5 @@ def test_values_that_are_given_are_not_drawn():
     drawn, given = scene(), scene()
     assert 0.82 <= build(drawn, Place(0.0, 0.0, 0.0), np.random.default_rng(0), "door")["wide"] <= 0.95
     build(given, Place(0.0, 0.0, 0.0), np.random.default_rng(0), "door", wide=2.0, height=1.0)
-    panel = next(s for s in given.surfaces if s.name == "door")
+    panel = next(s for s in given.quads if s.name == "door")
     assert (np.linalg.norm(panel.u_w), np.linalg.norm(panel.v_w)) == pytest.approx((2.0, 1.0))

@@ -7,7 +7,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.flights.courses import BUILDING_M
 from edgeslam_torch.synthetic.flights.flight import FlightPlan, fly
 from edgeslam_torch.synthetic.flights.paths import around
-from edgeslam_torch.synthetic.house.render import depth_map
+from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.house.views import look
 from edgeslam_torch.synthetic.sites.build import JUDGED, named_site, place
 from edgeslam_torch.synthetic.sites.obstacles import PASSAGE_M
@@ -75,7 +75,7 @@ def test_what_a_camera_sees_can_be_hit(name):
     site = named_site(name, 1)
     for yaw in (0.0, 1.3, 2.6):
         T_w_c = look(site.in_site(np.array([1.0, 0.1, 1.1])), yaw)
-        depth = depth_map(site.world, CAMERA, T_w_c)
+        depth = render(site.world, CAMERA, T_w_c).depth_m
         v, u = np.mgrid[2:60:9, 2:80:9]
         rays = CAMERA.back_project(np.stack([u.ravel(), v.ravel()], 1), depth[v, u].ravel().astype(float))
         hits = rays @ T_w_c[:3, :3].T + T_w_c[:3, 3]
@@ -100,7 +100,7 @@ def test_glass_is_hit_and_not_seen():
     hit = [free_at(site, (6.0, side * wide / 2, 1.5)) == 0 for side in (-1, 1)]
     assert sorted(hit) == [False, True]
     y = wide / 2 * (1 if hit[1] else -1)
-    seen = depth_map(site.world, CAMERA, look(np.array([5.0, y, 1.5]), 0.0))[30, 40]
+    seen = render(site.world, CAMERA, look(np.array([5.0, y, 1.5]), 0.0)).depth_m[30, 40]
     assert seen > 2.0
 
 

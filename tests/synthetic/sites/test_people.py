@@ -5,8 +5,9 @@ import pytest
 
 from edgeslam_torch.drone.emulator.drone import DroneModel, Mode
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.synthetic.house.render import depth_map
+from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.house.views import look
+from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.synthetic.sites.build import named_site
 from edgeslam_torch.synthetic.sites.people import walker
 
@@ -41,7 +42,7 @@ def test_people_are_seen_and_felt_where_they_are_now():
     for at_s in (0.0, 3.0):
         (x, y), _ = walkers[0].at(at_s)
         T = look(np.array([x - 2.0, y, 1.1]), 0.0)
-        depth = depth_map(site.painted(at_s), CAMERA, T)[30, 40]
+        depth = render(site.painted(at_s), CAMERA, T).depth_m[30, 40]
         assert 1.5 < depth < 1.95  # half their breadth or depth nearer than their middle
         hit = (np.array([x - 2.0 + depth, y, 1.1]) - site.T_site_w[:3, 3]) @ site.T_site_w[:3, :3]
         assert site.clearance(hit[None], at_s)[0] < 0.02
@@ -62,5 +63,5 @@ def test_a_hovering_drone_is_hit_by_who_walks_into_it(person):
 
 def test_a_walker_is_painted_where_they_can_be_hit(person):
     for at_s in (0.0, 4.3, 9.1):
-        corners = np.concatenate([quad.corners_w for quad in person.painted(at_s)])
+        corners = World(person.painted(at_s)).corners_w.reshape(-1, 3)
         assert person.distance(corners, at_s).max() < 1e-9
