@@ -7,44 +7,68 @@ import sys
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-TABLE = ROOT / "docs" / "architecture.md"
+PACKAGE = ROOT / "edgeslam_torch"
+LINKED = ("models", "losses", "train", "eval")
+"""Folders at the root that are parts of the package, by links where the checkout has them."""
 
 
-class Row(NamedTuple):
-    """A layer: parts of the package, and the parts that each of them may import."""
-
-    parts: tuple[str, ...]
-    may_use: frozenset[str]
-    is_all: bool
-    """Whether it says "all above" instead of names."""
+def names_in(cell):
+    return {name.strip("/") for name in re.findall(r"`([\w/]+)`", cell)}
 
 
-def layer_table(text):
-    """Rows of the table below ``| layer |``, from the bottom of the house up."""
-    rows = []
-    below = []
-    for line in text.split("| layer |", 1)[1].splitlines()[2:]:
-        if not line.startswith("|"):
-            break
-        parts, _, may_use = (cell.strip() for cell in line.strip("|").split("|"))
-        names = _names(parts)
-        is_all = may_use == "all above"
-        rows.append(Row(names, frozenset(below if is_all else _names(may_use)), is_all))
-        below += names
-    return rows
+TABLE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("| layer |", 1)[1].split("\n\n")[0]
+CELLS = [line.strip("|").split("|") for line in TABLE.splitlines()[2:]]
+LAYERS = [(names_in(parts), names_in(may_use), "all above" in may_use) for parts, _, may_use in CELLS]
+"""Parts of each layer from the bottom of the house up, what they may import, and whether that is all above."""
+PARTS = [part for parts, _, _ in LAYERS for part in parts]
 
 
-def _names(cell):
-    return tuple(name.strip("/") for name in re.findall(r"`([\w/]+)`", cell))
+def below(i):
+    return set().union(*(parts for parts, _, _ in LAYERS[:i]))
 
 
-LAYERS = layer_table(TABLE.read_text(encoding="utf-8"))
-PARTS = [part for row in LAYERS for part in row.parts]
+MAY_USE = {
+    part: (below(i) if is_all else may_use) | LAYERS[0][0]
+    for i, (parts, may_use, is_all) in enumerate(LAYERS)
+    for part in parts
+}
+"""Everybody may use the first row."""
+NEVER = {"evo", "gtsam", "djitellopy", "open3d", "torchvision", "pypose"}
+"""GPL, or measured and found wanting (docs/decisions/27-dependencies.md); tests may use some as outside oracles."""
+
+HEAVY = "torch kornia cv2 numpy numba scipy onnxruntime onnx matplotlib tensorboard rerun av"
+
+
+def module_name(path):
+    root = PACKAGE if path.is_relative_to(PACKAGE) else ROOT
+    return ".".join(("edgeslam_torch", *path.relative_to(root).with_suffix("").parts)).removesuffix(".__init__")
+
+
+MODULES = {module_name(path): path for name in ("edgeslam_torch", *LINKED) for path in (ROOT / name).rglob("*.py")}
+"""Files of the package by their full names."""
+
+
+@cache
+def imports(with_types=False):
+    """Names that each module imports when it runs, or for the type checker too; of a module of a package the module."""
+    found = {}
+    for module, path in MODULES.items():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        guarded = [n for n in ast.walk(tree) if isinstance(n, ast.If) and getattr(n.test, "id", "") == "TYPE_CHECKING"]
+        for_types = set() if with_types else {inner for node in guarded for inner in ast.walk(node)}
+        found[module] = names = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import) and node not in for_types:
+                names |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node not in for_types:
+                assert node.level == 0, "imports are by full name"
+                full = {f"{node.module}.{alias.name}" for alias in node.names}
+                names |= full & MODULES.keys() | ({node.module} if full - MODULES.keys() else set())
+    return found
 
 
 @cache
@@ -58,141 +82,38 @@ def part_of(name):
     return max(found, key=len, default=f"{path}, which is not in the table")
 
 
-PACKAGE = ROOT / "edgeslam_torch"
-LINKED = ("models", "losses", "train", "eval")
-"""Folders at the root that are parts of the package, by links where the checkout has them."""
-
-MAY_USE = {part: row.may_use | set(LAYERS[0].parts) for row in LAYERS for part in row.parts}
-"""Everybody may use the first row."""
-
-NEVER = {"evo", "gtsam", "djitellopy", "open3d", "torchvision", "pypose"}
-"""GPL, or measured and found wanting (docs/decisions/27-dependencies.md); tests may use some as outside oracles."""
-
-HEAVY = (
-    "torch",
-    "kornia",
-    "cv2",
-    "numpy",
-    "numba",
-    "scipy",
-    "onnxruntime",
-    "onnx",
-    "matplotlib",
-    "tensorboard",
-    "rerun",
-    "av",
-)
-
-
-def sources():
-    """Every module of the package, each once."""
-    files = [p for folder in (PACKAGE, *(ROOT / name for name in LINKED)) for p in folder.rglob("*.py")]
-    return sorted({p for p in files if "__pycache__" not in p.parts})
-
-
-class Import(NamedTuple):
-    """What one statement imports."""
-
-    names: frozenset[str]
-    """Full names; of ``from package import module`` the module counts, not the package."""
-    is_for_types: bool
-    """Whether only the type checker follows it."""
-
-
-def imports_in(node, known=frozenset(), is_for_types=False):
-    """Imports inside a parsed module or statement at any depth.
-
-    Args:
-        known: Full names of modules.
-    """
-    if isinstance(node, ast.Import):
-        yield Import(frozenset(alias.name for alias in node.names), is_for_types)
-    elif isinstance(node, ast.ImportFrom):
-        assert node.level == 0, "imports are by full name"
-        names = {f"{node.module}.{alias.name}" for alias in node.names}
-        yield Import(frozenset(names & known | ({node.module or ""} if names - known else set())), is_for_types)
-    is_for_types |= isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
-    for part in ("body", "orelse", "finalbody", "handlers", "cases"):  # no import stands in an expression
-        for inner in getattr(node, part, ()):
-            yield from imports_in(inner, known, is_for_types)
-
-
-def forbidden(module, names):
-    """Imports of a module that the table does not allow."""
-    own = part_of(module)
-    if own is None:
-        return []
-    allowed = MAY_USE.get(own, frozenset())
-    return [name for name in names if part_of(name) not in {None, own, *allowed}]
-
-
-def module_name(path):
-    """Full module name of a file in the package."""
-    folder = PACKAGE if path.is_relative_to(PACKAGE) else ROOT
-    return ".".join(("edgeslam_torch", *path.relative_to(folder).with_suffix("").parts)).removesuffix(".__init__")
-
-
-MODULES = frozenset(module_name(path) for path in sources())
-
-
-@cache
-def all_imports():
-    """Imports of each module of the package, by its full name."""
-    return {
-        module_name(path): list(imports_in(ast.parse(path.read_text(encoding="utf-8")), MODULES)) for path in sources()
-    }
-
-
-@cache
-def imports():
-    """Names that each module of the package imports when it runs."""
-    return {
-        module: [name for each in found if not each.is_for_types for name in each.names]
-        for module, found in all_imports().items()
-    }
-
-
-def test_table_names_every_part_once_and_nothing_else():
+def test_table_names_every_part_once_and_has_no_arrow_up():
     assert len(PARTS) == len(set(PARTS)) > 30
-    homes = {part_of(module) for module in MODULES} - {None}
-    assert homes == set(PARTS), "docs/architecture.md and the folders differ"
-
-
-def test_table_has_no_arrow_up():
-    for i, row in enumerate(LAYERS):
-        below = {part for lower in LAYERS[:i] for part in lower.parts}
-        assert row.may_use <= below, f"{row.parts} may use {set(row.may_use - below)}, which does not lie below"
+    assert {part_of(module) for module in MODULES} - {None} == set(PARTS), "docs/architecture.md and the folders differ"
+    for i, (parts, may_use, _) in enumerate(LAYERS):
+        assert may_use <= below(i), f"{parts} may use {may_use - below(i)}, which does not lie below"
 
 
 def test_imports_are_those_of_the_table():
-    found = {module: forbidden(module, names) for module, names in imports().items()}
-    assert {module: names for module, names in found.items() if names} == {}, "docs/architecture.md does not allow it"
+    used = {(part_of(module), part_of(name)) for module, names in imports().items() for name in names}
+    used = {(own, other) for own, other in used if None not in (own, other) and own != other}
+    assert {(own, other) for own, other in used if other not in MAY_USE[own]} == set(), (
+        "docs/architecture.md forbids it"
+    )
+    needless = {(*parts, other) for parts, may_use, _ in LAYERS for other in may_use
+                if not used & {(part, other) for part in parts}}  # fmt: skip
+    assert needless == set(), "docs/architecture.md allows what nobody imports"
 
 
 def test_no_files_import_each_other_in_a_circle():
-    graph = {module: {name for each in found for name in each.names} for module, found in all_imports().items()}
-    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
-
-
-def test_table_allows_only_imports_in_use():
-    used = {(part_of(module), part_of(name)) for module, names in imports().items() for name in names}
-    rows = [row for row in LAYERS if not row.is_all]
-    needless = [
-        (row.parts, other) for row in rows for other in row.may_use if not used & {(p, other) for p in row.parts}
-    ]
-    assert needless == []
+    TopologicalSorter(imports(with_types=True)).prepare()  # raises CycleError, which names the circle
 
 
 def test_packages_that_do_not_belong_are_not_imported():
-    tops = {module: {name.split(".")[0] for name in names} for module, names in imports().items()}
-    users = {name: {module for module, found in tops.items() if name in found} for name in {*NEVER, *LINKED}}
-    assert {name: users[name] for name in NEVER if users[name]} == {}
-    assert {name: users[name] for name in LINKED if users[name]} == {}, "import edgeslam_torch.losses, not losses"
+    tops = {(module, name.split(".")[0]) for module, names in imports().items() for name in names}
+    assert {(module, top) for module, top in tops if top in NEVER or top in LINKED} == set(), (
+        "import edgeslam_torch.losses, not losses"
+    )
 
 
 def loaded_by(statement, names=HEAVY):
     """Heavy packages that a fresh interpreter has after a statement."""
-    code = f"import sys; {statement}; print(' '.join(m for m in {names!r} if m in sys.modules))"
+    code = f"import sys; {statement}; print(' '.join(m for m in {names!r}.split() if m in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     return set(done.stdout.split())
 
@@ -205,14 +126,11 @@ def test_nothing_heavy_is_imported_at_first(statement):
 
 
 def test_slam_and_runs_load_neither_torch_nor_scipy_nor_a_compiler():
-    parts = [f"scipy.{part}" for part in ("linalg", "ndimage", "sparse", "spatial", "special")]
-    names = ["torch", "onnx", "matplotlib", "numba", *parts]
+    names = "torch onnx matplotlib numba scipy.linalg scipy.ndimage scipy.sparse scipy.spatial scipy.special"
     compiled = "from edgeslam_torch.frontend.keypoint_grid import nearest_pixels; nearest_pixels([[0, 0]], [[1, 1]], 1)"
     loaded_by(compiled)  # a first run compiles
-    assert (
-        loaded_by(f"import edgeslam_torch.run, edgeslam_torch.slam, edgeslam_torch.eval.report.page; {compiled}", names)
-        == set()
-    )
+    imported = "import edgeslam_torch.run, edgeslam_torch.slam, edgeslam_torch.eval.report.page"
+    assert loaded_by(f"{imported}; {compiled}", names) == set()
 
 
 def test_commands_that_only_list_their_options_load_no_torch():

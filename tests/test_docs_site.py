@@ -138,19 +138,3 @@ def test_what_a_page_would_load_is_found(tmp_path):
         "a.html: loads https://cdn.example/x.js from the network",
         "b.html: loads //cdn.example/x.css from the network",
     ]
-
-
-@pytest.mark.parametrize(
-    ("link", "uri", "page"),
-    [
-        ("docs/guides/tello.md", "index.md", "guides/tello.md"),
-        ("docs/decisions/", "index.md", "decisions/README.md"),
-        ("../../README.md", "guides/tello.md", "../index.md"),
-        ("../../CHANGELOG.md", "decisions/README.md", "../CHANGELOG.md"),
-        ("../start/install.md", "guides/tello.md", "../start/install.md"),
-        ("LICENSE", "index.md", "files/LICENSE.txt"),
-        ("nosuch.md", "guides/tello.md", "nosuch.md"),
-    ],
-)
-def test_links_of_the_repository_become_links_of_the_site(link, uri, page):
-    assert hooks.turned(link, uri, hooks.home(uri)) == page

@@ -97,21 +97,15 @@ def test_flight_with_known_depth_is_metric():
     assert np.rad2deg(np.linalg.norm(se3.log(a)[3:] - se3.log(b)[3:])) < 0.5
 
 
-def without_matching_corners(monkeypatch, change, config=NO_NETWORK):
-    """Frames past the panels, in whose second half no corner matches, and what ``change`` makes of these images."""
-    slam = EdgeSlam(CAMERA, config)
+def test_where_no_corner_matches_keyframes_rest_on_what_flow_sees(monkeypatch):
+    """Other corners came into view, clearer ones, and the detector has none left for those of the map."""
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
     for frame in panels().frames[:16]:
         slam.step(frame)
     monkeypatch.setattr(Tracker, "track_near", lambda *args: None)
-    outputs = [slam.step(replace(frame, image=change(frame.image))) for frame in panels().frames[16:]]
+    outputs = [slam.step(frame) for frame in panels().frames[16:]]
     check_map(slam.map)
-    return [k.frame_index for k in slam.keyframes() if k.frame_index >= 16], outputs
-
-
-def test_where_no_corner_matches_keyframes_rest_on_what_flow_sees(monkeypatch):
-    """Other corners came into view, clearer ones, and the detector has none left for those of the map."""
-    keyframes, outputs = without_matching_corners(monkeypatch, lambda image: image)
-    assert len(keyframes) >= 3
+    assert sum(k.frame_index >= 16 for k in slam.keyframes()) >= 3
     assert set(statuses(outputs)) == {FrameStatus.TRACKED}
     assert ate(np.stack([o.T_w_c for o in outputs]), panels().T_w_c[16:]) < 0.01
 
@@ -188,17 +182,6 @@ def test_fresh_edges_lie_on_the_surfaces_in_published_units(monkeypatch):
     again, doubled = slam.fresh_edges(newest, 0.6, 20.0)
     np.testing.assert_array_equal(uv, again)
     np.testing.assert_allclose(doubled, 2.0 * z)
-
-
-def test_two_runs_give_the_same_bytes():
-    (a, out_a), (b, out_b) = short_run(), go(panels().frames[:16])
-    assert a.trajectory()[1].tobytes() == b.trajectory()[1].tobytes()
-    assert a.edge_map().p_w.tobytes() == b.edge_map().p_w.tobytes()
-    assert a.anchors().p_w.tobytes() == b.anchors().p_w.tobytes()
-    for x, y in zip(out_a, out_b, strict=True):
-        assert x.T_w_c.tobytes() == y.T_w_c.tobytes()
-        # In words, which are exact: since Python 3.13 a NaN in a record differs from itself.
-        assert repr(replace(x, stage_ms={})) == repr(replace(y, stage_ms={}))
 
 
 # -- how it starts -----------------------------------------------------------------------------------------------

@@ -155,13 +155,6 @@ def test_size_of_the_board_is_found_by_trying(rng):
     assert board_size(pictures) == (7, 5)
 
 
-def test_the_file_says_how_well_the_focal_length_is_known(rng):
-    result = calibrate(views(rng, chessboard(), 12), Board(8, 6))
-    off = abs(result.camera.fx / CAMERA.fx - 1.0)
-    assert 1e-4 < result.camera.focal_sigma < 0.02
-    assert off < 4.0 * result.camera.focal_sigma
-
-
 def test_a_picture_that_moved_is_left_out(rng):
     good = list(views(rng, chessboard(), 12))
     shear = np.array([[1.0, 0.06, 0.0], [0.0, 1.0, 0.0]])  # what a rolling shutter makes of a quick turn
@@ -170,13 +163,6 @@ def test_a_picture_that_moved_is_left_out(rng):
     result = calibrate(pictures, Board(8, 6))
     assert "its corners miss" in result.rejected["moved.png"]
     assert result.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
-
-
-def test_no_board_at_all_is_an_error_that_says_what_to_do(rng):
-    with pytest.raises(CalibrationError, match="--board"):
-        calibrate([("noise.png", rng.integers(0, 255, (120, 160), dtype=np.uint8))], Board(8, 6))
-    with pytest.raises(CalibrationError, match="0 usable"):
-        calibrate([], Board())
 
 
 @pytest.mark.parametrize("wrong", [{"columns": 2, "rows": 6}, {"square_m": 0.0}, {"charuco": True}])

@@ -35,13 +35,6 @@ def test_guess_is_replaced_and_said(recording):
     assert len(list(source.frames())) == 16  # looking at them has not used them up
 
 
-def test_given_camera_is_kept(recording):
-    source = open_source(recording, "kinect")
-    before = source.camera
-    settle_camera(source)
-    assert source.camera is before
-
-
 def test_too_few_images_keep_the_guess_and_its_warning(recording):
     source = open_source(recording, max_frames=2)
     settle_camera(source)
@@ -50,9 +43,10 @@ def test_too_few_images_keep_the_guess_and_its_warning(recording):
     assert any("guessing a focal length of 384 px" in w for w in source.warnings)
 
 
-def test_live_source_is_not_touched(recording):
-    source = open_source(recording)
-    source.live = True
+@pytest.mark.parametrize(("given", "is_live"), [("kinect", False), (None, True)])
+def test_a_given_camera_and_a_live_source_are_not_touched(recording, given, is_live):
+    source = open_source(recording, given)
+    source.live = is_live
     before = source.camera
     settle_camera(source)
     assert source.camera is before

@@ -22,7 +22,7 @@ RAY = ["--ray", "local"]
 @pytest.mark.parametrize(
     "arguments",
     [["nowhere"], ["flights", "--jobs", "0"], ["flights", "--memory", "-5"], ["flights", "--timeout", "0"],
-     ["flights", "--set", "orb.featurs=5"], ["flights", "--ray", "auto", "--jobs", "2"]],
+     ["flights", "--set", "orb.featurs=5"], ["flights", "--ray", "auto", "--jobs", "2"], ["flights", "--ray", "auto"]],
 )  # fmt: skip
 def test_mistakes_are_reported_in_one_line(tmp_path, monkeypatch, write_images, capsys, arguments):
     monkeypatch.setitem(sys.modules, "ray", None)
@@ -143,10 +143,3 @@ def test_page_sorts_and_filters_in_a_browser(tmp_path):
         browser.run(f"({choose})(document.querySelector('#show'))")
         assert browser.run(order) == "x"
         assert browser.errors == []
-
-
-def test_missing_ray_is_named_with_its_extra(tmp_path, monkeypatch, write_images, capsys):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    write_images(tmp_path / "flights" / "a", ["0.png"])
-    assert main(["batch", str(tmp_path / "flights"), "--out", str(tmp_path / "out"), *RAY]) == 1
-    assert "pip install 'edgeslam-torch[fleet]'" in capsys.readouterr().err

@@ -35,18 +35,14 @@ def test_table_is_printed_written_and_compared(data, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     "arguments",
-    ["--only desk*", "--against nowhere", "--thresholds nowhere.toml", "--first-seed -1", "--release 0.3.json",
-     "--release 0.3.json --only stairs", "--set base", "--jobs 0"],
+    ["data --only desk*", "data --against nowhere", "data --thresholds nowhere.toml", "data --first-seed -1",
+     "data --release 0.3.json", "data --release 0.3.json --only stairs", "data --set base", "data --jobs 0", ""],
 )  # fmt: skip
-def test_mistakes_are_one_line(data, tmp_path, capsys, arguments):
-    assert cli.main(["judge", str(data), "--out", str(tmp_path / "out"), *arguments.split()]) == 1
-    assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_without_recordings_it_says_so(tmp_path, capsys, monkeypatch):
+def test_mistakes_are_one_line(data, tmp_path, capsys, monkeypatch, arguments):
     monkeypatch.delenv("EDGESLAM_DATA", raising=False)
-    assert cli.main(["judge", "--out", str(tmp_path)]) == 1
-    assert "no recordings: DATA or EDGESLAM_DATA" in capsys.readouterr().err
+    words = arguments.replace("data", str(data), 1).split()
+    assert cli.main(["judge", "--out", str(tmp_path / "out"), *words]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 @pytest.mark.parametrize("content", ["precious", '{"version": "1"}'])

@@ -27,21 +27,17 @@ def _check(parser, *words):
     check_outputs(parser, parser.parse_args([str(word) for word in words]))
 
 
-@pytest.mark.parametrize("name", [*OUTPUTS, "rgb.txt", "groundtruth.txt", "telemetry.csv", "mine.json"])
+@pytest.mark.parametrize(
+    "name",
+    [*OUTPUTS, "rgb.txt", "groundtruth.txt", "telemetry.csv", "mine.json", "rgb/1.png", "mav0/cam0/data/7.JPG"]
+    + ["flight.mp4", "bag_0.mcap", "bag_0.db3"],
+)
 def test_no_file_of_a_folder_that_is_read_is_replaced(parser, tmp_path, name):
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).touch()
     free = {"mine.json", "report.html", "config.toml"}  # not read
     with nullcontext() if name in free else pytest.raises(OutputError, match="reads"):
         _check(parser, tmp_path, "--json", tmp_path / name, "--overwrite")
-
-
-@pytest.mark.parametrize("name", ["rgb/1.png", "mav0/cam0/data/7.JPG", "flight.mp4", "bag_0.mcap", "bag_0.db3"])
-def test_no_picture_or_bag_within_a_recording_is_replaced(parser, tmp_path, name):
-    path = tmp_path / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.touch()
-    with pytest.raises(OutputError, match="reads"):
-        _check(parser, tmp_path, "--json", path, "--overwrite")
 
 
 @pytest.mark.parametrize(
@@ -89,9 +85,11 @@ def test_the_recording_of_a_run_is_read_with_it(parser, tmp_path, name):
         _check(parser, run, "--json", path, "--overwrite")
 
 
-def test_two_results_need_two_files(parser, tmp_path):
+def test_two_results_need_two_files_and_no_folder(parser, tmp_path):
     with pytest.raises(OutputError, match="twice"):
         _check(parser, "in", "--json", tmp_path / "a", "-m", tmp_path / "." / "a")
+    with pytest.raises(OutputError, match="folder"):
+        check_new(tmp_path, overwrite=True)
 
 
 @pytest.mark.parametrize(
@@ -124,8 +122,3 @@ def test_commands_leave_what_is_there(command, tmp_path, capsys):
     assert [p.name for p in tmp_path.iterdir()] == ["truth.txt"]
     last = capsys.readouterr().err.strip().splitlines()[-1]
     assert last.startswith("edgeslam: error: ") and str(path) in last
-
-
-def test_a_folder_is_no_file(tmp_path):
-    with pytest.raises(OutputError, match="folder"):
-        check_new(tmp_path, overwrite=True)

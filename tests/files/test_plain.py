@@ -44,6 +44,10 @@ def test_a_link_is_replaced_and_not_followed(theirs, name, link):
     assert theirs.read_text() == "theirs"
     assert not path.is_symlink()
     assert not path.samefile(theirs)
+    path.unlink()
+    path.symlink_to(theirs.with_name("nothing"))
+    REPLACING[name](path)
+    assert not theirs.with_name("nothing").exists()
 
 
 @pytest.mark.parametrize("link", [os.symlink, os.link])
@@ -92,22 +96,12 @@ def test_a_folder_of_ours_is_no_link(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "process 1 on board since yesterday"])
-def test_a_lock_of_a_killed_run_is_taken(tmp_path, text):
+def test_a_lock_of_a_killed_run_is_taken_and_one_of_another_program_stays(tmp_path, text):
     (tmp_path / ".lock").write_text(text)
     lock = FolderLock(tmp_path)
     assert (tmp_path / ".lock").read_text().startswith(f"process {os.getpid()} ")
     lock.release()
     assert not (tmp_path / ".lock").exists()
-
-
-@pytest.mark.parametrize("name", REPLACING)
-def test_a_link_to_nothing_makes_nothing_there(tmp_path, name):
-    (tmp_path / "a.png").symlink_to(tmp_path / "nothing.png")
-    REPLACING[name](tmp_path / "a.png")
-    assert not (tmp_path / "nothing.png").exists()
-
-
-def test_a_lock_of_another_program_stays(tmp_path):
     (tmp_path / ".lock").write_text("of another program")
     with pytest.raises(OutputError, match="--out"):
         FolderLock(tmp_path)

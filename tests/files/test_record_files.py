@@ -13,23 +13,11 @@ def test_a_record_is_read(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["JSON", "TOML"])
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b'x = "', "not valid"),
-        (b"\xff\xfe", "not valid"),
-        (b"9" * 5000, "not valid"),
-        (b"x = " + b"[" * 100_000, "not valid"),
-        (b"[" * 100_000, "not valid"),
-        (None, "No such file"),
-    ],
-)
-def test_what_is_no_record_is_refused_by_name(tmp_path, kind, content, words):
-    path = tmp_path / "settings"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(ConfigError, match=f"^{path}: {words}") as caught:
-        read_mapping(path, kind, ConfigError)
+@pytest.mark.parametrize("content", [b'x = "', b"\xff\xfe", b"9" * 5000, b"x = " + b"[" * 100_000])
+def test_what_is_no_record_is_refused_by_name(tmp_path, kind, content):
+    (tmp_path / "settings").write_bytes(content)
+    with pytest.raises(ConfigError, match=f"^{tmp_path / 'settings'}: not valid") as caught:
+        read_mapping(tmp_path / "settings", kind, ConfigError)
     assert "\n" not in str(caught.value)
 
 

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from edgeslam_torch.files.tensor_file import KINDS, Damaged, read_entries, write_tensors
 
@@ -26,32 +27,24 @@ def read(path):
         return remarks, {name: entry.array() for name, entry in entries.items()}
 
 
-def test_what_is_written_is_read(tmp_path):
+def test_what_is_written_is_read_also_by_others_unless_it_is_cut_off(tmp_path):
     write_tensors(tmp_path / "x", {"key": "words"}, ARRAYS)
     remarks, arrays = read(tmp_path / "x")
     assert remarks == {"key": "words"} and list(arrays) == list(ARRAYS)
+    by_others = safetensors.numpy.load_file(tmp_path / "x")
     for name, array in ARRAYS.items():
-        np.testing.assert_array_equal(arrays[name], array)
-        assert arrays[name].dtype == array.dtype
-
-
-def test_other_programs_read_it(tmp_path):
-    safetensors = pytest.importorskip("safetensors.numpy")
-    write_tensors(tmp_path / "x", {"key": "words"}, ARRAYS)
-    np.testing.assert_array_equal(safetensors.load_file(tmp_path / "x")["a"], ARRAYS["a"])
-
-
-def tensor(data, dtype="F32", shape=(1,), offsets=(0, 4), names="a"):
-    return raw({name: {"dtype": dtype, "shape": list(shape), "data_offsets": list(offsets)} for name in names}, data)
-
-
-def test_a_truncated_file_is_refused(tmp_path):
-    write_tensors(tmp_path / "x", {"key": "words"}, ARRAYS)
+        for found in (arrays[name], by_others[name]):
+            np.testing.assert_array_equal(found, array)
+            assert found.dtype == array.dtype
     whole = (tmp_path / "x").read_bytes()
     for length in [*range(0, len(whole), 7), len(whole) - 1]:
         (tmp_path / "x").write_bytes(whole[:length])
         with pytest.raises(Damaged):
             read(tmp_path / "x")
+
+
+def tensor(data, dtype="F32", shape=(1,), offsets=(0, 4), names="a"):
+    return raw({name: {"dtype": dtype, "shape": list(shape), "data_offsets": list(offsets)} for name in names}, data)
 
 
 @pytest.mark.parametrize(

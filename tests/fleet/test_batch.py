@@ -74,14 +74,16 @@ def test_failed_flight_is_a_row_with_its_reason_and_the_rest_is_done(tmp_path, r
     assert record["flights"][0]["figures"]["scale_error"] is None, "JSON has no NaN"
 
 
-def test_what_is_done_is_not_done_again_and_what_failed_is(tmp_path, recordings):
+def test_what_is_done_is_not_done_again_and_what_failed_or_changed_is(tmp_path, recordings, write_images):
     starter, said = Starter(b=BROKEN), []
     batch(tmp_path, recordings, starter)
     batch(tmp_path, recordings, starter, said=said)
     assert sorted(starter.started) == ["a", "b", "b", "c"]
     assert said[0] == "2 of 3 flights were done before"
     starter.scripts.clear()
+    write_images(recordings / "a", ["1.png"])
     assert states(batch(tmp_path, recordings, starter)) == {"a": "done", "b": "done", "c": "done"}
+    assert sorted(starter.started) == ["a", "a", "b", "b", "b", "c"]
 
 
 def test_other_settings_start_anew_and_keep_the_older_results(tmp_path, recordings):
@@ -92,14 +94,6 @@ def test_other_settings_start_anew_and_keep_the_older_results(tmp_path, recordin
     assert len(starter.started) == 6
     assert (tmp_path / "out" / "older" / "a" / "of_seed_0").exists()
     assert not (tmp_path / "out" / "flights" / "a" / "of_seed_0").exists()
-
-
-def test_changed_recording_is_run_again_alone(tmp_path, recordings, write_images):
-    starter = Starter()
-    batch(tmp_path, recordings, starter)
-    write_images(recordings / "b", ["1.png"])
-    batch(tmp_path, recordings, starter)
-    assert sorted(starter.started) == ["a", "b", "b", "c"]
 
 
 def test_interrupted_batch_leaves_a_table_of_what_is_finished(tmp_path, recordings):

@@ -169,24 +169,30 @@ def definition(kind):
     return text + "".join(f"{_RULE}MSG: {part}\n{_STANDARD[part]}" for part in seen)
 
 
-def write_ros1(path, events):
-    """``.bag`` by rosbags."""
+def write_ros1(path, events, packed=False):
+    """``.bag`` by rosbags, compressed by bzip2 or not."""
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC)
-    with Writer(path) as writer:
+    writer = Writer(path)
+    if packed:
+        writer.set_compression(Writer.CompressionFormat.BZ2)
+    with writer:
         _write(writer, store, store.serialize_ros1, events)
     return path
 
 
-def write_ros2(path, events):
-    """Folder with ``metadata.yaml`` and ``.db3`` by rosbags."""
-    from rosbags.rosbag2 import Writer
+def write_ros2(path, events, packed=None):
+    """Folder with ``metadata.yaml`` and ``.db3`` by rosbags; packed by ``MESSAGE`` or ``FILE``."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    with Writer(path, version=8) as writer:
+    writer = Writer(path, version=8)
+    if packed is not None:
+        writer.set_compression(CompressionMode[packed], CompressionFormat.ZSTD)
+    with writer:
         _write(writer, store, store.serialize_cdr, events)
     return path
 

@@ -20,16 +20,12 @@ WRITTEN = {
 }
 
 
-def encoded(name, options, width=67, height=45):
-    image = np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
-    return cv2.imencode(name[name.index(".") :], image[:, :, 0] if name.endswith("pgm") else image, options)[
-        1
-    ].tobytes()
-
-
 @pytest.mark.parametrize("name", WRITTEN)
-def test_size_of_what_opencv_writes(name):
-    assert image_size(encoded(name, WRITTEN[name])) == (67, 45)
+def test_size_of_what_opencv_writes_even_where_it_is_cut_off(name):
+    image = np.random.default_rng(0).integers(0, 256, (45, 67, 3), dtype=np.uint8)
+    data = cv2.imencode(name[name.index(".") :], image, WRITTEN[name])[1].tobytes()
+    assert image_size(data) == (67, 45)
+    assert all(image_size(data[:n]) in (None, (67, 45)) for n in range(200))
 
 
 @pytest.mark.parametrize(
@@ -59,9 +55,3 @@ def test_size_by_the_formats_own_words(data, size):
 def test_any_bytes_have_a_size_or_none(begin, rest):
     size = image_size(begin + rest)
     assert size is None or min(size) >= 0
-
-
-@pytest.mark.parametrize("name", WRITTEN)
-def test_cut_off_headers_have_no_size_or_the_right_one(name):
-    data = encoded(name, WRITTEN[name])
-    assert all(image_size(data[:n]) in (None, (67, 45)) for n in range(200))

@@ -91,12 +91,6 @@ def test_a_list_is_read_however_a_spreadsheet_wrote_it(tmp_path, line, encoding,
     assert problems == []
 
 
-def test_repeated_stamp_is_left_out_and_named():
-    kept, problems = in_order(entries([*range(10), 9, 10, 11, 12]), "rgb.txt")
-    assert len(kept) == 13
-    assert "repetition" in problems[0].reason
-
-
 def test_shuffled_list_is_sorted_and_said(rng):
     stamps = rng.permutation(50)
     kept, problems = in_order(entries(stamps), "rgb.txt")

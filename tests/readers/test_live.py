@@ -1,7 +1,6 @@
 import signal
 import threading
 
-import cv2
 import numpy as np
 import pytest
 
@@ -9,7 +8,7 @@ from edgeslam_torch.cli import main
 from edgeslam_torch.drone.emulator.server import TelloEmulator
 from edgeslam_torch.drone.video_stream import Picture
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.readers.live import CaptureFeed, LiveSource, open_live
+from edgeslam_torch.readers.live import LiveSource
 
 
 class FakeFeed:
@@ -29,9 +28,13 @@ class FakeFeed:
         self.closed += 1
 
 
+def live(feed):
+    return LiveSource("webcam:0", feed, [], None, None, is_drone=False)
+
+
 def test_frames_carry_the_gaps_of_what_was_missed():
     feed = FakeFeed([1, 2, 5])
-    source = LiveSource("webcam:0", feed, [], None, None, is_drone=False)
+    source = live(feed)
     assert [f.index for f in source.frames()] == [0, 1, 4]
     assert "no picture" in source.problems[0].reason
     assert feed.closed == 1
@@ -46,14 +49,14 @@ def sized(feed, counts):
 
 
 def test_a_picture_of_an_odd_size_is_left_out_and_said():
-    source = LiveSource("webcam:0", sized(FakeFeed(range(1, 9)), {3, 4, 6}), [], None, None, is_drone=False)
+    source = live(sized(FakeFeed(range(1, 9)), {3, 4, 6}))
     assert [f.index for f in source.frames()] == [0, 1, 4, 6, 7]
     assert sum("32x24, not 64x48" in problem.reason for problem in source.problems) == 1
 
 
 def test_another_resolution_for_seconds_ends_the_source_with_its_reason():
     feed = sized(FakeFeed(range(1, 90)), range(10, 90))
-    frames = LiveSource("webcam:0", feed, [], None, None, is_drone=False).frames()
+    frames = live(feed).frames()
     assert sum(1 for _, frame in zip(range(9), frames, strict=False) if frame.image.shape[:2] == (48, 64)) == 9
     with pytest.raises(SourceError, match=r"webcam:0: pictures are 32x24 now and were 64x48.*start again"):
         next(frames)
@@ -62,7 +65,7 @@ def test_another_resolution_for_seconds_ends_the_source_with_its_reason():
 
 def test_a_source_that_is_ended_stops_while_it_waits():
     feed = FakeFeed([1, 2])
-    source = LiveSource("webcam:0", feed, [], None, None, is_drone=False)
+    source = live(feed)
     wait = feed.wait
 
     def silent(after_count, timeout_s):
@@ -94,7 +97,7 @@ def test_emulator_ends_whichever_of_its_threads_gets_the_signal(capsys, monkeypa
 
 def test_device_is_given_back_when_the_taker_stops_early():
     feed = FakeFeed(range(1, 50))
-    frames = LiveSource("webcam:0", feed, [], None, None, is_drone=False).frames()
+    frames = live(feed).frames()
     next(frames)
     frames.close()
     assert feed.closed == 1
@@ -103,35 +106,12 @@ def test_device_is_given_back_when_the_taker_stops_early():
 def test_no_picture_is_an_error_and_gives_the_device_back():
     feed = FakeFeed([])
     with pytest.raises(SourceError, match="no picture"):
-        LiveSource("rtsp://somewhere", feed, [], None, None, is_drone=False)
+        live(feed)
     assert feed.closed == 1
 
 
-@pytest.mark.parametrize("spec", ["webcam:", "webcam:front", "webcam:-1"])
-def test_webcams_are_numbered(spec):
-    with pytest.raises(SourceError, match="webcam:N"):
-        open_live(spec)
-
-
-def test_flying_needs_a_drone(capsys):
-    assert main(["record", "webcam:0", "--fly"]) == 1
-    assert "--fly" in capsys.readouterr().err
-
-
 def test_remarks_on_what_came_are_warnings_once():
-    source = LiveSource("webcam:0", FakeFeed([1]), [], None, None, is_drone=False)
+    source = live(FakeFeed([1]))
     assert len(list(source.frames())) == 1
     source.close()
     assert [w for w in source.warnings if "refused" in w] == ["webcam:0: 3 packets refused"]
-
-
-def test_capture_gives_pictures_with_arrival_times(tmp_path):
-    path = tmp_path / "clip.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, (64, 48))
-    for k in range(10):
-        writer.write(np.full((48, 64, 3), 20 * k, np.uint8))
-    writer.release()
-    feed = CaptureFeed(str(path), "clip")
-    picture = feed.wait(0, 5.0)
-    assert picture.image.shape == (48, 64, 3)
-    feed.close()

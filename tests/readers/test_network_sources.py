@@ -1,97 +1,75 @@
 """Cameras that people have: RTSP, MJPEG over HTTP, GStreamer pipelines, a webcam."""
 
-import io
 import shutil
 import threading
+from contextlib import closing, contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import count
 
 import cv2
 import numpy as np
 import pytest
 from free_ports import free_ports
+from streams import coded
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.live import open_live, without_password
 from edgeslam_torch.readers.source import open_source
 
 
-class _Mjpeg(BaseHTTPRequestHandler):
-    """A phone's camera app: pictures one after the other, the first blue, then red."""
+@contextmanager
+def served(pieces, multipart=True):
+    """Address of a camera that sends pieces until nobody listens."""
 
-    def do_GET(self):
-        self.send_response(200)
-        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-        self.end_headers()
-        for i in range(200):
-            colour = (255, 0, 0) if i == 0 else (0, 0, 255)
-            data = cv2.imencode(".jpg", np.full((48, 64, 3), colour, np.uint8))[1].tobytes()
-            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-            try:
-                self.wfile.write(head.encode() + data + b"\r\n")
-            except OSError:
-                return
+    class Camera(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            if multipart:
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+            self.end_headers()
+            with suppress(OSError):
+                for piece in pieces:
+                    self.wfile.write(piece)
 
-    def log_message(self, *_):
-        pass
+        def log_message(self, *_):
+            pass
 
-
-def test_a_phones_mjpeg_over_http():
-    server = ThreadingHTTPServer(("127.0.0.1", 0), _Mjpeg)
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Camera)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
-        source = open_source(f"http://127.0.0.1:{server.server_port}/video", max_frames=2)
-        frames = list(source.frames())
+        yield f"http://127.0.0.1:{server.server_port}/video"
     finally:
         server.shutdown()
         server.server_close()
+
+
+def part(colour, size=(64, 48)):
+    """A picture of a phone's camera app."""
+    data = cv2.imencode(".jpg", np.full((size[1], size[0], 3), colour, np.uint8))[1].tobytes()
+    return f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n".encode() + data + b"\r\n"
+
+
+def test_a_phones_mjpeg_over_http():
+    with served([part((255, 0, 0)), *[part((0, 0, 255))] * 199]) as address:
+        frames = list(open_source(address, max_frames=2).frames())
     assert frames and frames[0].image.shape == (48, 64, 3)
     assert np.abs(frames[-1].image[20, 20].astype(int) - (0, 0, 255)).max() < 10
 
 
-def _jpegs(width, height):
-    data = cv2.imencode(".jpg", np.full((height, width, 3), 90, np.uint8))[1].tobytes()
-    return f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n".encode() + data + b"\r\n"
-
-
-def _h264(width, height):
-    av = pytest.importorskip("av")
-    clip = io.BytesIO()
-    with av.open(clip, "w", format="h264") as container:
-        stream = container.add_stream("libx264", rate=30, width=width, height=height, pix_fmt="yuv420p")
-        picture = av.VideoFrame.from_ndarray(np.full((height, width, 3), 90, np.uint8), format="bgr24")
-        for packet in [*(p for _ in range(5) for p in stream.encode(picture)), *stream.encode(None)]:
-            container.mux(packet)
-    return clip.getvalue()
-
-
-@pytest.mark.parametrize("coded", [_jpegs, _h264])
-def test_a_stream_whose_resolution_changes_ends_with_its_reason_and_is_not_stretched(coded):
-    large, small, changed = coded(128, 96), coded(128, 48), threading.Event()
-
-    class Changing(_Mjpeg):
-        def do_GET(self):
-            self.send_response(200)
-            if coded is _jpegs:
-                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-            self.end_headers()
-            try:
-                while True:
-                    self.wfile.write(small if changed.is_set() else large)
-            except OSError:
-                return
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Changing)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    frames = open_source(f"http://127.0.0.1:{server.server_port}/video").frames()
-    try:
-        with pytest.raises(SourceError, match="128x48 now and were 128x96: the resolution was changed in mid-stream"):
+@pytest.mark.parametrize("is_mjpeg", [True, False])
+def test_a_stream_whose_resolution_changes_ends_with_its_reason_and_is_not_stretched(is_mjpeg):
+    encode = coded("libx264", "h264")
+    large, small = (part(90, size) if is_mjpeg else encode(*size, 5) for size in ((128, 96), (128, 48)))
+    changed = threading.Event()
+    with served((small if changed.is_set() else large for _ in count()), is_mjpeg) as address:
+        frames = open_source(address).frames()
+        with (
+            closing(frames),
+            pytest.raises(SourceError, match="128x48 now and were 128x96: the resolution"),
+        ):
             for frame in frames:
                 assert frame.image.shape == (96, 128, 3)
                 changed.set()
-    finally:
-        frames.close()
-        server.shutdown()
-        server.server_close()
 
 
 def test_an_address_where_nobody_is_is_refused_without_its_password():

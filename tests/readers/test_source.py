@@ -196,12 +196,6 @@ def test_the_length_of_a_part_is_the_number_of_its_frames(tmp_path, write_tum, s
     assert part.length == len(list(part.frames()))
 
 
-def test_frames_can_be_had_again_and_are_the_same(tmp_path, write_tum):
-    source = open_source(write_tum(tmp_path, 4))
-    first, second = list(source.frames()), list(source.frames())
-    assert all(np.array_equal(a.image, b.image) and a.stamp_s == b.stamp_s for a, b in zip(first, second, strict=True))
-
-
 def test_seven_scenes_frame_that_is_there_twice_is_used_once(tmp_path, write_images):
     names = ["frame-000000.color.png", "frame-000001.color.png", "frame-000001.color.jpg", "frame-²2.color.png"]
     write_images(tmp_path, names, (640, 480))
@@ -231,15 +225,6 @@ def test_malformed_lines_of_a_list_are_named(tmp_path, write_tum):
     assert source.length == 3
     assert len(source.problems) == 3
     assert source.problems[0].file.endswith("rgb.txt:5")
-
-
-def test_sixteen_bit_and_alpha_images_become_eight_bit(tmp_path):
-    cv2.imwrite(str(tmp_path / "1.png"), np.full((48, 64), 0x8000, dtype=np.uint16))
-    cv2.imwrite(str(tmp_path / "2.png"), np.full((48, 64, 4), 7, dtype=np.uint8))
-    frames = list(open_source(tmp_path).frames())
-    assert frames[0].image.dtype == np.uint8
-    assert frames[0].image[0, 0] == 128
-    assert frames[1].image.shape == (48, 64, 3)
 
 
 def test_one_image_is_a_source(tmp_path, write_images):

@@ -6,11 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edgeslam_torch.drone.sdk_state import FIELDS, parse_state, sample_from_sdk
+from edgeslam_torch.drone.sdk_state import parse_state, sample_from_sdk
 from edgeslam_torch.readers.telemetry_csv import (
     HEADER,
     TelemetryError,
-    TelemetryUnits,
     TelemetryWriter,
     detect_units,
     read_table,
@@ -51,7 +50,7 @@ def test_what_no_tello_gives_is_missing(packet):
     assert np.isnan([sample.velocity_m_s[0], sample.tof_m, sample.battery]).all()
 
 
-def test_what_is_written_is_read_back(tmp_path):
+def test_what_is_written_is_read_back_and_a_row_cut_by_a_crash_costs_only_itself(tmp_path):
     path = tmp_path / "telemetry.csv"
     fields = parse_state(REAL)
     with TelemetryWriter(path) as writer:
@@ -62,29 +61,21 @@ def test_what_is_written_is_read_back(tmp_path):
     assert first.stamp_s == 12.5
     assert second.velocity_m_s[0] == pytest.approx(0.4)
     assert math.isnan(second.tof_m)
-
-
-def test_a_row_cut_by_a_crash_costs_only_that_row(tmp_path):
-    path = tmp_path / "telemetry.csv"
-    with TelemetryWriter(path) as writer:
-        writer.write(1.0, {"vgx": 1.0})
     with path.open("a") as file:
-        file.write("1.1,3")  # the power went
+        file.write("12.7,3")  # the power went
     with TelemetryWriter(path) as writer:
-        writer.write(1.2, {"vgx": 2.0})
+        writer.write(12.8, fields)
     table = read_table(path)
-    np.testing.assert_array_equal(table.stamps_s, [1.0, 1.2])
+    np.testing.assert_array_equal(table.stamps_s, [12.5, 12.6, 12.8])
     assert table.skipped == 1
 
 
 def test_rows_without_order_or_numbers_are_skipped_and_counted(tmp_path):
-    path = write(
-        tmp_path, "stamp_s,vgx,bat\n1,1,90\n1,2,90\nx,3,90\n2,,90\n0.5,4,90\n3,5\n\n# note\n1e300,7,90\n4,6,90\n"
-    )
-    table = read_table(path)
+    rows = "1,1,90,5\n1,2,90,5\nx,3,90,5\n2,,90,5\n0.5,4,90,5\n3,5\n\n# note\n1e300,7,90,5\n4,6,90,5\n"
+    table = read_table(write(tmp_path, f"stamp_s,vgx,bat,vgx\n{rows}"))
     np.testing.assert_array_equal(table.stamps_s, [1.0, 2.0, 4.0])
     assert table.skipped == 5
-    assert math.isnan(table.values["vgx"][1])
+    np.testing.assert_array_equal(table.values["vgx"][1:], [np.nan, 6.0])  # the first column of the name
 
 
 @pytest.mark.parametrize(("clock", "unit_s"), [("time_us", 1e-6), ("stamp_ns", 1e-9), ("t (ms)", 1e-3), ("ts_s", 1.0)])
@@ -170,14 +161,9 @@ def test_a_flight_that_another_program_logged_is_read_the_same(tmp_path, how):
     assert (sample.height_m if how.startswith("h in") else sample.tof_m) == pytest.approx(1.04, abs=0.011)
 
 
-cells = st.one_of(
-    st.floats(allow_nan=True, allow_infinity=True).map(str),
-    st.sampled_from(["", "-", "1e999", "nan", "0x10", "1_0", "６", " 5 ", '"', "None"]),
-    st.text(max_size=6),
-)
+ODD = st.sampled_from(["", "-", "1e999", "nan", "0x10", "1_0", "６", " 5 ", '"', "None"])
+cells = st.one_of(st.floats(allow_nan=True, allow_infinity=True).map(str), ODD, st.text(max_size=6))
 lines = st.one_of(st.lists(cells, max_size=16).map(",".join), st.just(",".join(HEADER)), st.text(max_size=60))
-
-
 TABLES = st.lists(lines, max_size=6).map(lambda rows: "\n".join([",".join(HEADER), *rows]))
 
 
@@ -191,15 +177,6 @@ def test_anything_is_read_or_refused(tmp_path, data):
         assert "\n" not in str(error)
     else:
         assert all(b > a for a, b in pairwise(stamps))
-
-
-@given(st.one_of(st.binary(max_size=300), st.lists(st.tuples(st.sampled_from(FIELDS), cells)).map(
-    lambda pairs: ";".join(f"{k}:{v}" for k, v in pairs).encode("utf-8", "surrogatepass"))))  # fmt: skip
-def test_any_packet_gives_a_sample(packet):
-    sample = sample_from_sdk(0.0, parse_state(packet))
-    assert sample.velocity_m_s.shape == (3,)
-    assert not np.isinf(sample.velocity_m_s).any()
-    assert math.isnan(sample.battery) or 0.0 <= sample.battery <= 1.0
 
 
 @pytest.mark.parametrize(
@@ -236,35 +213,20 @@ def test_units_of_header_and_cells_are_read(tmp_path, header, cell, field, expec
 
 
 @pytest.mark.parametrize(
-    ("times", "seconds"),
+    ("times", "seconds", "skipped"),
     [
-        (["4294967000", "4294967100", "4294967200", "4", "104"], 0.1),  # 2**32 ms
-        (["23:59:59.8", "23:59:59.9", "00:00:00.0", "00:00:00.1"], 0.1),
-        (['"2024-05-01, 12:00:00.0"', '"2024-05-01, 12:00:00.5"', '"2024-05-01, 12:00:01.0"'], 0.5),
-        (["01.05.2024 12:00:00.0", "01.05.2024 12:00:00.5", "01.05.2024 12:00:01.0"], 0.5),
+        (["12:00:00.0", "09:00:00.1", "09:00:00.2", "09:00:00.3"], 0.1, 1),  # set back by three hours
+        (["100.0", "100.1", "1e15", "100.2"], 0.1, 1),  # one wild stamp
+        (["4294967000", "4294967100", "4294967200", "4", "104"], 0.1, 0),  # 2**32 ms
+        (["23:59:59.8", "23:59:59.9", "00:00:00.0", "00:00:00.1"], 0.1, 0),
+        (['"2024-05-01, 12:00:00.0"', '"2024-05-01, 12:00:00.5"', '"2024-05-01, 12:00:01.0"'], 0.5, 0),
+        (["01.05.2024 12:00:00.0", "01.05.2024 12:00:00.5", "01.05.2024 12:00:01.0"], 0.5, 0),
     ],
 )
-def test_clocks_that_begin_anew_and_dates_are_read(tmp_path, times, seconds):
+def test_clocks_that_begin_anew_and_dates_are_read_and_wild_ones_cost_a_row(tmp_path, times, seconds, skipped):
     table = read_table(write(tmp_path, "timestamp,yaw\n" + "".join(f"{t},1\n" for t in times)))
     np.testing.assert_allclose(np.diff(table.stamps_s), seconds, atol=0.005)
-    assert len(table.stamps_s) == len(times)
-
-
-@pytest.mark.parametrize(
-    "times",
-    [
-        ["12:00:00.0", "09:00:00.1", "09:00:00.2", "09:00:00.3"],  # set back by three hours
-        ["100.0", "100.1", "1e15", "100.2"],  # one wild stamp
-    ],
-)
-def test_clocks_that_are_set_back_or_wild_do_not_begin_anew_and_cost_a_row(tmp_path, times):
-    table = read_table(write(tmp_path, "timestamp,yaw\n" + "".join(f"{t},1\n" for t in times)))
-    np.testing.assert_allclose(np.diff(table.stamps_s), 0.1, atol=0.005)
-    assert (len(table.stamps_s), table.skipped) == (3, 1)
-
-
-def test_of_two_columns_of_one_name_the_first_counts(tmp_path):
-    assert read_table(write(tmp_path, "timestamp,yaw,yaw\n0,1,5\n0.1,2,6\n")).values["yaw"].tolist() == [1, 2]
+    assert (len(table.stamps_s), table.skipped) == (len(times) - skipped, skipped)
 
 
 @pytest.mark.parametrize(
@@ -307,11 +269,6 @@ def test_a_constant_height_determines_no_unit(tmp_path):
     rows = [f"{100 * k},0,0,{2 + k % 3},100" for k in range(100)]
     table = read_table(write(tmp_path, "\n".join(["timestamp,vx,vy,vz,tof", *rows]) + "\n"))
     assert "too little vertical motion" in detect_units(table).evidence
-
-
-def test_units_can_be_given(tmp_path):
-    path = climbing(tmp_path, 0.1, -1)
-    assert read_telemetry(path, TelemetryUnits(0.01))[0][0].velocity_m_s[2] == pytest.approx(0.04, abs=0.001)
 
 
 @pytest.mark.data

@@ -152,10 +152,6 @@ def test_pictures_are_undistorted_and_keyframes_have_features_drawn(flight):
     assert np.abs(drawn[9:16, 7:14].astype(int) - expected[9:16, 7:14]).max() > 40  # a keypoint at (10, 12)
 
 
-def _level(status):
-    return status.level if isinstance(status.level, int) else status.level[0]
-
-
 def test_levels_follow_what_a_pilot_may_rely_on():
     lost = _output(0, FrameStatus.LOST, reason="3 inliers", metric=False)
     assert [level for _, level, _, _ in state_of(lost)] == [2, 1]

@@ -55,18 +55,12 @@ def test_without_extent_there_are_axes_too(points):
     assert np.isfinite(axes.low).all() and 0 < axes.scale < np.inf
 
 
-def test_points_outside_are_not_drawn():
+def test_points_outside_are_not_drawn_nor_a_paths_gaps():
     image = page()
     axes = axes_around(image, np.array([[0.0, 0.0], [1.0, 1.0]]))
     draw_points(axes, np.array([[50.0, 0.5], [0.5, -1e9]]), np.ones((2, 3)), cell_px=3)
     assert not changed(image).any()
-
-
-def test_a_path_is_drawn_without_its_gaps():
-    image = page()
-    points = np.array([[0.0, 0.0], [np.nan, 1.0], [1.0, 1.0], [1e12, 0.0]])
-    axes = axes_around(image, points[[0, 2]])
-    draw_path(axes, points, (255, 0, 0), 1)
+    draw_path(axes, np.array([[0.0, 0.0], [np.nan, 1.0], [1.0, 1.0], [1e12, 0.0]]), (255, 0, 0), 1)
     assert (image[:, :, 0] > 200).sum() > 50
 
 
@@ -75,11 +69,7 @@ def test_text_is_cut_at_the_border(at):
     image = page()
     text(image, "along [m]", at, 0.5, anchor=(0.5, 0.5))
     assert changed(image).any() == (at[0] >= 0)
-
-
-def test_upright_text_is_as_high_as_it_is_long():
     image = page(200, 200)
     text(image, "height [m]", (100, 100), 0.5, anchor=(0.5, 0.5), upright=True)
     v, u = np.nonzero(changed(image))
-    assert np.ptp(v) == pytest.approx(text_size("height [m]", 0.5)[0], abs=6)
-    assert np.ptp(u) < 30
+    assert np.ptp(v) == pytest.approx(text_size("height [m]", 0.5)[0], abs=6) and np.ptp(u) < 30

@@ -84,15 +84,6 @@ def test_mcap_of_ros1_or_without_a_profile_is_read(tmp_path, profile):
     _check_read(_mcap_of_ros1(tmp_path / "a.mcap", profile, 4), 4)
 
 
-def test_a_bag_that_is_still_being_written_names_the_remedy(tmp_path):
-    whole = bags.write_ros1(tmp_path / "a.bag", _pictures(0, 1)).read_bytes()
-    at = whole.index(b"index_pos=") + len(b"index_pos=")
-    path = tmp_path / "a.bag.active"
-    path.write_bytes(whole[:at] + bytes(8) + whole[at + 8 :])
-    with pytest.raises(SourceError, match="rosbag reindex"):
-        open_source(path)
-
-
 def _database(tmp_path):
     bags.write_ros2(tmp_path / "made", _pictures(0, 3))
     path = tmp_path / "a.db3"
@@ -157,40 +148,16 @@ def test_decompression_stops_at_its_bound(monkeypatch):
                     chunk_bytes(name, packed)
 
 
-def _packed_ros1(path):
-    from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC)
-    writer = Writer(path)
-    writer.set_compression(Writer.CompressionFormat.BZ2)
-    with writer:
-        bags._write(writer, store, store.serialize_ros1, _pictures(0, 3))
-    return path
-
-
-def _packed_ros2(path, mode):
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    writer = Writer(path, version=8)
-    writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
-    with writer:
-        bags._write(writer, store, store.serialize_cdr, _pictures(0, 3))
-    return path
-
-
 @pytest.mark.parametrize("form", ["bz2", "mcap", "mcap of ros1", "MESSAGE", "FILE"])
 def test_what_grows_beyond_the_bound_is_refused_and_the_rest_is_read(tmp_path, monkeypatch, form):
     if form == "bz2":
-        path = _packed_ros1(tmp_path / "a.bag")
+        path = bags.write_ros1(tmp_path / "a.bag", _pictures(0, 3), packed=True)
     elif form == "mcap":
         path = bags.write_mcap(tmp_path / "a.mcap", _pictures(0, 3))
     elif form == "mcap of ros1":
         path = _mcap_of_ros1(tmp_path / "a.mcap", "ros1", 3)
     else:
-        path = _packed_ros2(tmp_path / "a", form)
+        path = bags.write_ros2(tmp_path / "a", _pictures(0, 3), form)
     _check_read(path, 3)
     monkeypatch.setattr(limits, "MAX_CHUNK_BYTES", 9000)  # a picture has 9216 bytes
     monkeypatch.setattr(limits, "MAX_FILE_RATIO", 0)
@@ -256,13 +223,6 @@ def test_a_pipe_in_a_bags_folder_is_refused(tmp_path, name):
         open_source(tmp_path / "bag")
 
 
-def test_mcap_of_ros1_that_was_not_closed_is_refused_with_the_remedy(tmp_path):
-    path = _mcap_of_ros1(tmp_path / "a.mcap", "ros1", 4)
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(SourceError, match="mcap recover"):
-        list(open_source(path).frames())
-
-
 def test_sixteen_bits_of_a_thermal_camera_are_read_where_the_topic_is_named(tmp_path):
     data = (7000 + 100 * np.arange(48 * 64).reshape(48, 64) % 1500).astype(np.uint16)
     times = [BEGIN_S + i / 30 for i in range(3)]
@@ -275,9 +235,35 @@ def test_sixteen_bits_of_a_thermal_camera_are_read_where_the_topic_is_named(tmp_
     assert any("16UC1" in problem.reason for problem in source.problems)
 
 
-def test_a_damaged_database_is_refused_with_the_remedy(tmp_path):
+def _unfinished(tmp_path):
+    whole = bags.write_ros1(tmp_path / "a.bag", _pictures(0, 1)).read_bytes()
+    at = whole.index(b"index_pos=") + len(b"index_pos=")
+    path = tmp_path / "a.bag.active"
+    path.write_bytes(whole[:at] + bytes(8) + whole[at + 8 :])
+    return path
+
+
+def _cut_off(tmp_path):
+    path = _mcap_of_ros1(tmp_path / "a.mcap", "ros1", 4)
+    path.write_bytes(path.read_bytes()[:-200])
+    return path
+
+
+def _damaged(tmp_path):
     path = bags.write_ros2(tmp_path / "bag", _pictures(0, 20))
     database = next(path.glob("*.db3"))
     database.write_bytes(database.read_bytes()[:60_000])
-    with pytest.raises(SourceError, match=r"damaged; repair it with: sqlite3 .* \.recover"):
-        list(open_source(path).frames())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("made", "remedy"),
+    [
+        (_unfinished, "rosbag reindex"),
+        (_cut_off, "mcap recover"),
+        (_damaged, r"damaged; repair it with: sqlite3 .* \.recover"),
+    ],
+)
+def test_what_was_not_closed_is_refused_with_the_remedy(tmp_path, made, remedy):
+    with pytest.raises(SourceError, match=remedy):
+        list(open_source(made(tmp_path)).frames())
