@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edgeslam_torch.errors import WeightsError
-from edgeslam_torch.files.download import FAILURES, Progress, discard, fetch, reason_of, remembered
+from edgeslam_torch.files.download import DownloadError, Progress, discard, fetch_any, remembered
 from edgeslam_torch.models.weights_file import MAX_FILE_BYTES
 
 
@@ -75,20 +75,12 @@ def download(
         OSError: If the file cannot be written.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
-    reasons = []
-    for url in urls:
-        # One partial file per protocol: bytes received over http stay untrusted.
-        part = target.with_name(f"{target.name}.{url.split(':')[0]}.part")
-        try:
-            fetch(url, part, MAX_FILE_BYTES, progress)
-            break
-        except FAILURES as error:
-            reasons.append(f"{url} ({reason_of(error)})")
-    else:
-        raise WeightsError(f"download failed: {'; '.join(reasons)}; the part received is kept; run it again to resume")
+    try:
+        url, part = fetch_any(urls, target, MAX_FILE_BYTES, progress)
+    except DownloadError as error:
+        raise WeightsError(f"download failed: {error}; the part received is kept; run it again to resume") from error
     with part.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    before = remembered(target)
+        found, before = hashlib.file_digest(file, "sha256").hexdigest(), remembered(target)
     expected = (sha256 or before or found).lower()
     if found != expected:
         discard(part)

@@ -3,19 +3,17 @@
 import argparse
 import math
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgeslam_torch.commands.run import add_device
-from edgeslam_torch.errors import ConfigError, OutputError, SourceError
+from edgeslam_torch.commands.shared import EXIT_INTERRUPTED, add_settings, resolved_config, say
+from edgeslam_torch.errors import ConfigError, SourceError
 
 if TYPE_CHECKING:
     from edgeslam_torch.eval.experiment.runner import Runner
     from edgeslam_torch.fleet.folder import BatchSettings
     from edgeslam_torch.fleet.manifest import Flight
 
-EXIT_INTERRUPTED = 130
 MEMORY_MB = 4000.0
 """Seven times what a flight of half a minute takes."""
 _SHARE = 0.8
@@ -45,13 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MB",
         help="most memory of a flight (default: 4000, or an equal share of 80 %% of this machine's if that is less)",
     )
-    parser.add_argument("--depth", metavar="FILE|NAME|none", help="depth network of all flights, as for 'run'")
-    add_device(parser)
+    add_settings(parser, " of all flights")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop every flight after N frames")
-    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of all flights")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting; may be repeated"
-    )
     parser.add_argument("--seed", type=int, help="seed of the robust estimators (default: 0)")
     parser.add_argument(
         "--map-score", action="store_true", help="compare maps with measured depth too (slower, a gigabyte each)"
@@ -73,14 +66,10 @@ def main(args: argparse.Namespace) -> int:
             raise ConfigError(f"{name} must be positive, got {value:g}")
     flights = _without(read_manifests(args.manifest), args.out)
     try:
-        rows = run_batch(flights, _settings(args), args.out, _runner(args), _say)
+        rows = run_batch(flights, _settings(args), args.out, _runner(args), say)
     except KeyboardInterrupt:
-        sys.stderr.write(
-            f"edgeslam: interrupted; {args.out} holds what was finished; run the same command to continue\n"
-        )
+        say(f"interrupted; {args.out} holds what was finished; run the same command to continue")
         return EXIT_INTERRUPTED
-    except OSError as error:
-        raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
     failed = [row for row in rows if row.state == FAILED]
     for row in failed:
         print(str(row))
@@ -98,7 +87,6 @@ def _without(flights: "list[Flight]", out: Path) -> "list[Flight]":
 
 
 def _settings(args: argparse.Namespace) -> "BatchSettings":
-    from edgeslam_torch.commands.run import resolved_config
     from edgeslam_torch.fleet.folder import BatchSettings
 
     if args.depth is not None and os.path.exists(args.depth):
@@ -128,7 +116,3 @@ def _memory_mb() -> float:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**20
     except (AttributeError, ValueError, OSError):
         return math.inf
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(f"edgeslam: {text}\n")

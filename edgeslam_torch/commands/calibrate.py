@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from edgeslam_torch.calibration.board import Board
 
-_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
 _LIVE_GAP_S = 1.0
 _RECORDED_GAP_S = 0.5
 """Of each such stretch of a recording the sharpest picture is used."""
@@ -48,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Calibrate, write the file, and print its quality."""
     from edgeslam_torch.calibration.board import Board, calibrate
-    from edgeslam_torch.errors import CalibrationError, ConfigError, OutputError
+    from edgeslam_torch.errors import CalibrationError, ConfigError
     from edgeslam_torch.readers.source import LIVE_SCHEMES
 
     if sum(map(bool, (args.board, args.charuco, args.aprilgrid))) > 1:
@@ -70,11 +69,8 @@ def main(args: argparse.Namespace) -> int:
             raise
         name, reason = next(iter(unreadable.items()))
         raise CalibrationError(f"{error}; {len(unreadable)} could not be read (the first: {name}: {reason})") from error
-    try:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        save_camera(args.out, result.camera)
-    except OSError as error:
-        raise OutputError(f"{args.out}: cannot be written: {error.strerror or error}") from error
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    save_camera(args.out, result.camera)
     camera, sigma = result.camera, result.sigma
     left_out = {**unreadable, **result.rejected}
     for name, reason in list(left_out.items())[:_MAX_NAMED]:
@@ -111,15 +107,13 @@ def _pictures(names: list[str], unreadable: dict[str, str]) -> "Iterator[tuple[s
     import cv2
 
     from edgeslam_torch.errors import SourceError
-    from edgeslam_torch.readers.images import read_pixels
+    from edgeslam_torch.readers.images import SUFFIXES, image_files, read_pixels
 
     for name in names:
         path = Path(name).expanduser()
         if not path.exists():
             raise SourceError(f"{path}: no such picture, folder or recording")
-        files = [path] if path.suffix.lower() in _PICTURES else []
-        if path.is_dir():
-            files = sorted(p for p in path.iterdir() if p.suffix.lower() in _PICTURES)
+        files = [path] if path.suffix.lower() in SUFFIXES else image_files(path) if path.is_dir() else []
         if not files:
             yield from _recorded_pictures(path, unreadable)
         for file in files:
@@ -133,6 +127,7 @@ def _recorded_pictures(path: Path, unreadable: dict[str, str]) -> "Iterator[tupl
     """The sharpest picture of each half second of a video, bag or recording."""
     import cv2
 
+    from edgeslam_torch.frontend.image import as_grey
     from edgeslam_torch.readers.listing import Problem
     from edgeslam_torch.readers.source import frames_without_camera
 
@@ -140,7 +135,7 @@ def _recorded_pictures(path: Path, unreadable: dict[str, str]) -> "Iterator[tupl
     best: tuple[float, str, np.ndarray] | None = None
     until_s = -math.inf
     for frame in frames_without_camera(path, problems):
-        grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY) if frame.image.ndim == 3 else frame.image
+        grey = as_grey(frame.image)
         sharpness = float(cv2.Laplacian(grey, cv2.CV_16S).var())
         if frame.stamp_s >= until_s:
             if best is not None:
@@ -155,9 +150,8 @@ def _recorded_pictures(path: Path, unreadable: dict[str, str]) -> "Iterator[tupl
 
 def _live_pictures(spec: str, board: "Board", views: int) -> "Iterator[tuple[str, np.ndarray]]":
     """Pictures with a visible board, a second apart; prints what the user should change."""
-    import cv2
-
     from edgeslam_torch.calibration.board import board_size, find_board
+    from edgeslam_torch.frontend.image import as_grey
     from edgeslam_torch.readers.live import open_live
 
     source = open_live(spec, "tello" if spec.startswith("tello://") else None)
@@ -166,7 +160,7 @@ def _live_pictures(spec: str, board: "Board", views: int) -> "Iterator[tuple[str
         for frame in source.frames():
             if time.monotonic() - last_s < _LIVE_GAP_S:
                 continue
-            grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY) if frame.image.ndim == 3 else frame.image
+            grey = as_grey(frame.image)
             seen = board_size([grey]) if board.columns == 0 else find_board("", grey, board)
             if seen is None:
                 continue

@@ -1,11 +1,11 @@
 """Published recordings: list them, and fetch them from their authors."""
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-EXIT_INTERRUPTED = 130
+from edgeslam_torch.commands.shared import EXIT_INTERRUPTED, say
+
 _CHECKSUM = {"publisher": "checksum by its publisher", "agreed": "checksum recorded by independent projects"}
 
 
@@ -47,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         fetch(args.names, recordings_folder(args.to), args.agree, print, args.archive, args.keep_archives)
     except KeyboardInterrupt:
-        sys.stderr.write("edgeslam: interrupted; run the same command to resume\n")
+        say("interrupted; run the same command to resume")
         return EXIT_INTERRUPTED
     return 0
 

@@ -5,12 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgeslam_torch.commands.run import add_device
+from edgeslam_torch.commands.shared import EXIT_INTERRUPTED, add_settings, check_tracked, resolved_config, write_page
 
 if TYPE_CHECKING:
     from edgeslam_torch.demo import DemoResult, DemoSettings
-
-EXIT_INTERRUPTED = 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,16 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--no-telemetry", action="store_true", help="fly without telemetry: no metres from the drone")
     parser.add_argument("--imu", action="store_true", help="carry an IMU (200 Hz, MPU-6050 grade)")
-    parser.add_argument(
-        "--depth",
-        metavar="FILE|NAME|none",
-        help="depth network: weights, near, an ONNX file, a downloaded network, or none",
-    )
-    add_device(parser)
-    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of the pipeline")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting; may be repeated"
-    )
+    add_settings(parser)
     parser.add_argument("--record-only", action="store_true", help="only write the simulated recording, to DIR/flight")
     parser.add_argument(
         "--flights",
@@ -63,7 +52,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run the demo and print the results."""
-    from edgeslam_torch.commands.run import check_tracked, resolved_config, write_page
     from edgeslam_torch.demo import SCORE, record, run_and_judge
     from edgeslam_torch.terminal.run_progress import RunProgress
     from edgeslam_torch.writers.own_folder import check_free

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from edgeslam_torch.commands.shared import positive_number
 from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.files.output_file import add_overwrite_to, check_new
 
@@ -47,8 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="cpu",
         help="where it runs (default: cpu; auto: the fastest that is there)",
     )
-    parser.add_argument("--threads", type=_positive, default=1, metavar="N", help="threads of one inference")
-    parser.add_argument("--max-frames", type=_positive, metavar="N", help="stop after N images")
+    parser.add_argument("--threads", type=positive_number, default=1, metavar="N", help="threads of one inference")
+    parser.add_argument("--max-frames", type=positive_number, metavar="N", help="stop after N images")
     add_overwrite_to(parser)
     parser.add_argument("--sigma", action="store_true", help="write STEM_sigma.npy, too")
 
@@ -71,21 +72,18 @@ def main(args: argparse.Namespace) -> int:
     checked, contradiction = CheckedDepth(network), ""
     shares: list[float] = []
     stems: set[str] = set()
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-        for frame in counted(frames, "depth", "image", length):
-            _spare_the_source(args.out, frame.path)
-            image = np.asarray(camera.undistort_image(frame.image), np.uint8)
-            depth = network(image, camera)
-            contradiction = checked.contradiction(depth, image, camera)
-            depth, share = _believable(depth)
-            shares.append(share)
-            stem = _stem(frame, stems)
-            for name in _names(stem, args.sigma):
-                check_new(args.out / name, args.overwrite)
-            write_depth(args.out, stem, depth, args.sigma)
-    except OSError as error:
-        raise OutputError(f"{error.filename or args.out}: cannot be written ({error.strerror or error})") from error
+    args.out.mkdir(parents=True, exist_ok=True)
+    for frame in counted(frames, "depth", "image", length):
+        _spare_the_source(args.out, frame.path)
+        image = np.asarray(camera.undistort_image(frame.image), np.uint8)
+        depth = network(image, camera)
+        contradiction = checked.contradiction(depth, image, camera)
+        depth, share = _believable(depth)
+        shares.append(share)
+        stem = _stem(frame, stems)
+        for name in _names(stem, args.sigma):
+            check_new(args.out / name, args.overwrite)
+        write_depth(args.out, stem, depth, args.sigma)
     for problem in problems[:_MAX_PROBLEMS_SHOWN]:
         print(f"{'left out' if problem.frames else 'note'}: {problem.file}: {problem.reason}")
     if len(problems) > _MAX_PROBLEMS_SHOWN:
@@ -153,12 +151,6 @@ def _stem(frame: "Frame", taken: set[str]) -> str:
     stem = frame.path.stem if frame.path.stem not in taken else frame.path.name
     taken.add(stem)
     return stem
-
-
-def _positive(text: str) -> int:
-    if not text.isascii() or not text.isdecimal() or len(text) > 9 or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text[:40]!r}")
-    return int(text)
 
 
 def _frames(

@@ -76,30 +76,27 @@ def _export(args: argparse.Namespace, progress: "Progress") -> int:
     images = list(counted(_images(args.calibrate, height, width, metadata), "reading", "image"))
     if args.int8 and len(images) < MIN_CALIBRATION_IMAGES:
         raise ConfigError(f"{args.calibrate}: --int8 needs {MIN_CALIBRATION_IMAGES} images, there are {len(images)}")
-    try:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory() as folder:
-            progress.phase("exporting")
-            plain = Path(folder) / "float32.onnx"
-            options = ExportOptions(height, width, opset, args.dynamic_size, args.dynamic_batch)
-            export_onnx(network, metadata, plain, options)
-            models = {"float32": _Model(plain)}
-            progress.phase("comparing with torch")
-            _require_parity(models["float32"], deployed(network, metadata), images[:CHECK_IMAGES])
-            target = plain
-            if args.int8 or args.fp16:
-                progress.phase(f"quantising, calibrated on {len(images)} images" if args.int8 else "storing float16")
-                target = Path(folder) / "target.onnx"
-                if args.int8:
-                    quantize_int8(plain, target, images)
-                else:
-                    store_float16(plain, target)
-                models["int8" if args.int8 else "float16"] = _Model(target)
-            progress.phase("timing")
-            print(_table(models, images[:CHECK_IMAGES]))
-            write_atomically(args.out, lambda file: file.write(target.read_bytes()))
-    except OSError as error:
-        raise OutputError(f"{args.out}: cannot be written ({error.strerror or error})") from error
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory() as folder:
+        progress.phase("exporting")
+        plain = Path(folder) / "float32.onnx"
+        options = ExportOptions(height, width, opset, args.dynamic_size, args.dynamic_batch)
+        export_onnx(network, metadata, plain, options)
+        models = {"float32": _Model(plain)}
+        progress.phase("comparing with torch")
+        _require_parity(models["float32"], deployed(network, metadata), images[:CHECK_IMAGES])
+        target = plain
+        if args.int8 or args.fp16:
+            progress.phase(f"quantising, calibrated on {len(images)} images" if args.int8 else "storing float16")
+            target = Path(folder) / "target.onnx"
+            if args.int8:
+                quantize_int8(plain, target, images)
+            else:
+                store_float16(plain, target)
+            models["int8" if args.int8 else "float16"] = _Model(target)
+        progress.phase("timing")
+        print(_table(models, images[:CHECK_IMAGES]))
+        write_atomically(args.out, lambda file: file.write(target.read_bytes()))
     size = "any size in multiples of 32" if args.dynamic_size else f"{height}x{width}"
     batch = ", any batch" if args.dynamic_batch else ""
     print(f"{args.out}: {size}{batch}, opset {opset}, focal length {metadata.focal_px:.1f} px in the input")

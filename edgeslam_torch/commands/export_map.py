@@ -58,10 +58,9 @@ def main(args: argparse.Namespace) -> int:
     if args.format == "occupancy":
         check_pictures(out.parent, lambda path: path.with_suffix(".yaml").exists(), "give another --out")
     cloud = _chosen(run, args)
-    try:
-        place = _WRITERS[args.format](run, cloud, args)
-    except OSError as error:
-        raise OutputError(f"{error.filename or args.out}: cannot be written ({error.strerror or error})") from error
+    if args.out is None and args.format in ("colmap", "nerfstudio"):
+        subfolder(run.path, out.name)
+    place = _WRITERS[args.format](run, cloud, out, args)
     print(f"{len(cloud.p_w)} points: {place}; {run.vertical}")
     if run.units == "arbitrary":
         print("the run's units are arbitrary (no metric scale): lengths in this file are not metres")
@@ -101,38 +100,34 @@ def _chosen(run: "RunFolder", args: argparse.Namespace) -> "PointCloud":
     return PointCloud(cloud.p_w[keep], cloud.colour[keep], cloud.sigma_m[keep], cloud.observations[keep])
 
 
-def _ply(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+def _ply(run: "RunFolder", cloud: "PointCloud", path: Path, args: argparse.Namespace) -> Path:
     from edgeslam_torch.writers.maps.directions import edge_directions
     from edgeslam_torch.writers.ply import write_ply
 
-    path: Path = args.out or run.path / _PLACES["ply"]
     centres_w = run.trajectory.positions[run.keyframe_poses()]
     write_ply(path, cloud, (f"units: {run.units}", run.vertical), edge_directions(cloud.p_w, centres_w))
     return path
 
 
-def _las(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+def _las(run: "RunFolder", cloud: "PointCloud", path: Path, args: argparse.Namespace) -> Path:
     from edgeslam_torch.writers.maps.las import write_las
 
-    path: Path = args.out or run.path / _PLACES["las"]
     write_las(path, cloud, run.vertical)
     return path
 
 
-def _pcd(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+def _pcd(run: "RunFolder", cloud: "PointCloud", path: Path, args: argparse.Namespace) -> Path:
     from edgeslam_torch.writers.maps.pcd import write_pcd
 
-    path: Path = args.out or run.path / _PLACES["pcd"]
     write_pcd(path, cloud, run.vertical)
     return path
 
 
-def _colmap(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+def _colmap(run: "RunFolder", cloud: "PointCloud", folder: Path, args: argparse.Namespace) -> Path:
     from edgeslam_torch.eval.report.keyframe_pictures import image_paths
     from edgeslam_torch.geometry.camera_file import load_camera
     from edgeslam_torch.writers.maps.colmap import write_colmap
 
-    folder: Path = args.out or subfolder(run.path, _PLACES["colmap"])
     camera = load_camera(run.path / "camera.yaml")
     seen, anchors, index = _seen(run)
     paths = image_paths(run, seen.stamps_s)
@@ -146,12 +141,11 @@ def _colmap(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> 
     return folder
 
 
-def _nerfstudio(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+def _nerfstudio(run: "RunFolder", cloud: "PointCloud", folder: Path, args: argparse.Namespace) -> Path:
     from edgeslam_torch.eval.report.keyframe_pictures import image_paths
     from edgeslam_torch.geometry.camera_file import load_camera
     from edgeslam_torch.writers.maps.nerfstudio import write_nerfstudio
 
-    folder: Path = args.out or subfolder(run.path, _PLACES["nerfstudio"])
     camera = load_camera(run.path / "camera.yaml")
     seen, anchors, index = _seen(run)
     paths = [path for path in image_paths(run, seen.stamps_s) if path is not None]
@@ -188,7 +182,7 @@ def _seen(
     return seen, anchors, index.tolist()
 
 
-def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+def _occupancy(run: "RunFolder", cloud: "PointCloud", path: Path, args: argparse.Namespace) -> Path:
     import numpy as np
 
     from edgeslam_torch.writers.occupancy import SightLines, occupancy_grid, write_occupancy
@@ -208,7 +202,6 @@ def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) 
     seen, anchors, index = _seen(run, "free space of the grid needs camera poses")
     eye_w = run.trajectory.positions[index]
     lines = SightLines(eye_w[seen.keyframe], anchors.p_w[seen.anchor].astype(float), anchors.sigma_m[seen.anchor])
-    path: Path = args.out or run.path / _PLACES["occupancy"]
     write_occupancy(path, occupancy_grid(cloud.p_w, lines, run.trajectory.positions, args.resolution, heights))
     return path.with_suffix(".yaml")
 

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.output_file import add_overwrite_to, check_new, output_file
 
 COMPARISON = "comparison.html"
@@ -46,11 +46,7 @@ def _write(args: argparse.Namespace) -> int:
     for run in args.runs:
         if len(args.runs) == 2 and run.is_file():
             continue  # a trajectory alone has no report, but can be compared
-        try:
-            path = write_report(run, args.groundtruth, judge_map=not args.no_map_score)
-        except OSError as error:
-            raise OutputError(f"{run / 'report.html'}: cannot be written ({error.strerror or error})") from error
-        _say(path)
+        _say(write_report(run, args.groundtruth, judge_map=not args.no_map_score))
     if len(args.runs) == 2:
         _say(_compared(args))
     return 0
@@ -62,10 +58,7 @@ def _compared(args: argparse.Namespace) -> Path:
     first, second = args.runs
     out: Path = args.out if args.out is not None else first.resolve().parent / COMPARISON
     check_new(out, args.overwrite)
-    try:
-        return write_comparison(first, second, out, args.groundtruth, judge_map=not args.no_map_score)
-    except OSError as error:
-        raise OutputError(f"{out}: cannot be written ({error.strerror or error})") from error
+    return write_comparison(first, second, out, args.groundtruth, judge_map=not args.no_map_score)
 
 
 def _say(path: Path) -> None:

@@ -2,13 +2,23 @@
 
 import argparse
 import os
-import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from edgeslam_torch.commands.shared import (
+    EXIT_INTERRUPTED,
+    add_settings,
+    add_topic,
+    check_tracked,
+    positive_number,
+    resolved_config,
+    say,
+    whole_number,
+    write_page,
+)
 from edgeslam_torch.files.output_file import output_file
 
 if TYPE_CHECKING:
@@ -18,7 +28,6 @@ if TYPE_CHECKING:
     from edgeslam_torch.readers.source import Source
     from edgeslam_torch.run import RunResult
 
-EXIT_INTERRUPTED = 130
 _MAX_PROBLEMS_SHOWN = 3
 
 
@@ -49,19 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="its noise, mount and clock: imu.yaml, Kalibr's, ORB-SLAM3's (default: beside it)",
     )
-    parser.add_argument(
-        "--topic",
-        action="append",
-        default=[],
-        metavar="[ROLE=]NAME",
-        help="topic of a ROS bag to use, such as /cam0/image_raw or odom=/x (list: edgeslam topics); may be repeated",
-    )
-    parser.add_argument(
-        "--depth",
-        metavar="FILE|NAME|none",
-        help="depth network: weights, near, an ONNX file, a downloaded network, or none",
-    )
-    add_device(parser)
+    add_topic(parser, "topic of a ROS bag to use, such as /cam0/image_raw or odom=/x (list: edgeslam topics)")
+    add_settings(parser)
     parser.add_argument(
         "--mode",
         choices=("offline", "realtime"),
@@ -76,17 +74,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--record", type=Path, metavar="DIR", help="record a live source, to run it again")
     parser.add_argument("--lossless", action="store_true", help="record PNG instead of JPEG (quality 95)")
-    parser.add_argument("--start", type=_whole, default=0, metavar="N", help="leave out the first N frames")
-    parser.add_argument("--stride", type=_positive_int, default=1, metavar="N", help="use every N-th frame")
-    parser.add_argument("--max-frames", type=_positive_int, metavar="N", help="stop after N frames")
-    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings; a run's config.toml is one")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="SECTION.KEY=VALUE",
-        help="change one setting, such as orb.features=1500; may be repeated",
-    )
+    parser.add_argument("--start", type=whole_number, default=0, metavar="N", help="leave out the first N frames")
+    parser.add_argument("--stride", type=positive_number, default=1, metavar="N", help="use every N-th frame")
+    parser.add_argument("--max-frames", type=positive_number, metavar="N", help="stop after N frames")
     parser.add_argument("--seed", type=int, help="seed of the robust estimators (default: 0)")
     parser.add_argument(
         "--progress",
@@ -109,15 +99,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-report", action="store_true", help="do not write the page report.html")
 
 
-def add_device(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--device``, which `resolved_config` reads."""
-    parser.add_argument(
-        "--device",
-        choices=("auto", "cpu", "cuda", "mps"),
-        help="where the depth network runs; all else is computed on the processor (default: cpu)",
-    )
-
-
 def main(args: argparse.Namespace) -> int:
     """Run, and print a short summary."""
     from edgeslam_torch.errors import ConfigError
@@ -137,12 +118,12 @@ def main(args: argparse.Namespace) -> int:
         if earlier is not None:
             _check_fits(earlier, source, config, args.atlas)
         for warning in source.warnings:
-            _say(f"warning: {warning}")
-        _say(_camera_words(source.camera))
+            say(f"warning: {warning}")
+        say(_camera_words(source.camera))
         mode = Mode(args.mode) if args.mode else (Mode.REALTIME if source.live else Mode.OFFLINE)
         out = args.out if args.out is not None else _new_folder(Path("runs") / source.name)
         if (out / "summary.json").exists():
-            _say(f"replaces the earlier run in {out}")
+            say(f"replaces the earlier run in {out}")
         progress.follow(source)
         listeners: list[Listener] = [progress]
         saved = None
@@ -176,9 +157,7 @@ def main(args: argparse.Namespace) -> int:
     if saved is not None and saved.failure is not None:
         raise OutputError(f"{saved.failure}; the results in {result.folder} are complete")
     if result.interrupted:
-        sys.stderr.write(
-            f"edgeslam: interrupted after {result.summary['frames']} frames; results are in {result.folder}\n"
-        )
+        say(f"interrupted after {result.summary['frames']} frames; results are in {result.folder}")
         return EXIT_INTERRUPTED
     check_tracked(result)
     return 0
@@ -204,21 +183,6 @@ def _new_folder(folder: Path) -> Path:
     """``runs/NAME``, or ``runs/NAME-2`` and so on beside older runs: none is replaced unless ``--out`` names it."""
     candidates = (folder if number == 1 else folder.with_name(f"{folder.name}-{number}") for number in count(1))
     return next(path for path in candidates if not path.exists() or (path.is_dir() and not any(path.iterdir())))
-
-
-def check_tracked(result: "RunResult") -> None:
-    """A run that tracked nothing is no success.
-
-    Raises:
-        SourceError: If no frame was tracked.
-    """
-    from edgeslam_torch.errors import SourceError
-
-    if not result.summary["tracked"]:
-        raise SourceError(
-            f"no frame was tracked against a map ({result.summary['last_reason'] or 'no reason known'}): the poses in "
-            f"{result.folder} are guesses; the camera must move sideways, up or down, and see something with texture"
-        )
 
 
 def _recorded(args: argparse.Namespace) -> "Source":
@@ -299,45 +263,15 @@ def _atlas_words(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def resolved_config(args: argparse.Namespace) -> "SlamConfig":
-    """Defaults overridden by ``--config``, ``--set`` and named options, in this order."""
-    from edgeslam_torch.config import SlamConfig
-    from edgeslam_torch.errors import ConfigError
-    from edgeslam_torch.files.config_file import load_config
-
-    config = load_config(SlamConfig(), args.config, args.set)
-    if args.seed is not None:
-        try:
-            config = replace(config, seed=args.seed)
-        except ValueError as error:
-            raise ConfigError(f"--seed: {error}") from error
-    if args.depth is not None:
-        config = replace(config, depth=replace(config.depth, weights=args.depth))
-    if args.device is not None:
-        config = replace(config, depth=replace(config.depth, device=args.device))
-    return config
-
-
-def write_page(result: "RunResult") -> None:
-    """``report.html``; failure to make the page does not fail the run."""
-    from edgeslam_torch.errors import EdgeSlamError
-    from edgeslam_torch.eval.report.page import write_report
-
-    try:
-        write_report(result.folder, judge_map=False)
-    except (EdgeSlamError, OSError, ValueError) as error:
-        _say(f"warning: report.html could not be made ({error})")
-
-
 def _report(result: "RunResult", source: "Source") -> None:
     summary = result.summary
     scale = summary["scale"]
     for problem in source.problems[:_MAX_PROBLEMS_SHOWN]:
-        _say(f"{'left out' if problem.frames else 'note'}: {problem.file}: {problem.reason}")
+        say(f"{'left out' if problem.frames else 'note'}: {problem.file}: {problem.reason}")
     if len(source.problems) > _MAX_PROBLEMS_SHOWN:
-        _say(f"left out: {summary['left_out']} in all, listed in {result.folder / 'summary.json'}")
+        say(f"left out: {summary['left_out']} in all, listed in {result.folder / 'summary.json'}")
     for warning in summary["warnings"][len(source.warnings) :]:  # the source's warnings were printed before the run
-        _say(f"warning: {warning}")
+        say(f"warning: {warning}")
     missed = "".join(
         f"; {summary[key]} {words}"
         for key, words in (("left_out", "left out"), ("dropped_frames", "dropped to keep up"))
@@ -357,7 +291,7 @@ def _report(result: "RunResult", source: "Source") -> None:
         print("units are arbitrary: neither telemetry, an IMU nor a depth network provided the scale")
     counts = summary["map"]
     if counts["edge_points"] == 0:
-        _say("warning: the edge map is empty")
+        say("warning: the edge map is empty")
     print(f"map: {counts['edge_points']} edge points, {counts['anchors']} anchors, {counts['keyframes']} keyframes")
     for line in [*summary["joins"], *summary["loops"], *_atlas_words(summary)]:
         print(line)
@@ -379,21 +313,3 @@ def _lost_words(summary: dict[str, Any]) -> str:
         return ""
     count = summary["lost_events"]
     return {0: "never lost, ", 1: "lost once, "}.get(count, f"lost {count} times, ")
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(f"edgeslam: {text}\n")
-
-
-def _whole(text: str, least: int = 0) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if not least <= value < 2**31:
-        raise argparse.ArgumentTypeError(f"must be a whole number of at least {least}, got {text[:40]!r}")
-    return value
-
-
-def _positive_int(text: str) -> int:
-    return _whole(text, 1)

@@ -3,17 +3,13 @@
 import argparse
 from pathlib import Path
 
+from edgeslam_torch.commands.shared import add_topic
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("bag", type=Path, metavar="FILE", help=".bag, .mcap or .db3 file, or folder of a ROS 2 bag")
-    parser.add_argument(
-        "--topic",
-        action="append",
-        default=[],
-        metavar="[ROLE=]NAME",
-        help="as for 'edgeslam run': shows what this choice uses; may be repeated",
-    )
+    add_topic(parser, "as for 'edgeslam run': shows what this choice uses")
 
 
 def main(args: argparse.Namespace) -> int:

@@ -4,7 +4,6 @@ import argparse
 import webbrowser
 from pathlib import Path
 
-from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.output_file import output_file
 
 
@@ -25,10 +24,7 @@ def main(args: argparse.Namespace) -> int:
     if args.viewer or args.save_rrd is not None:
         return _rerun(args)
     page = args.run / "report.html"
-    try:
-        page = page if page.is_file() else _written(args.run)
-    except OSError as error:
-        raise OutputError(f"{page}: cannot be written ({error.strerror or error})") from error
+    page = page if page.is_file() else _written(args.run)
     print(page.resolve())
     if not args.only_print and not webbrowser.open(page.resolve().as_uri()):
         print("no browser here: copy the page to a machine with one; it is self-contained")

@@ -5,7 +5,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.output_file import check_new, output_file
 from edgeslam_torch.models.record import weights_file
 
@@ -78,15 +78,12 @@ def _download(args: argparse.Namespace) -> None:
         raise ConfigError(f"no weights called {args.name!r}; there are {', '.join([*REMOTES, *PRESETS])}")
     if args.out is not None and args.name in PRESETS:  # the description is written beside the network
         check_new(args.out.with_suffix(".toml"), args.overwrite)
-    try:
-        before = remembered(raw)
-        fetched = _fetch(remote, raw, args.sha256)
-        target = args.out or cache_folder() / f"{remote.name}{suffix}"
-        target.parent.mkdir(parents=True, exist_ok=True)
-        (_describe if args.name in PRESETS else _converted)(args.name, raw, target)
-        kept = remember(raw, fetched.sha256)  # remember the checksum of valid files only
-    except OSError as error:
-        raise OutputError(f"{error.filename or raw}: cannot be written ({error.strerror or error})") from error
+    before = remembered(raw)
+    fetched = _fetch(remote, raw, args.sha256)
+    target = args.out or cache_folder() / f"{remote.name}{suffix}"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    (_describe if args.name in PRESETS else _converted)(args.name, raw, target)
+    kept = remember(raw, fetched.sha256)  # remember the checksum of valid files only
     print(f"{fetched.url}\nsha256 {fetched.sha256}, {_trust(args.sha256, before, fetched, kept)}")
     print(target)
 
@@ -139,11 +136,8 @@ def _sha256(text: str) -> str:
 def _convert(args: argparse.Namespace) -> None:
     from edgeslam_torch.models.convert import convert_upstream
 
-    try:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        metadata = convert_upstream(args.checkpoint, args.out)
-    except OSError as error:
-        raise OutputError(f"{args.out}: cannot be written ({error.strerror or error})") from error
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    metadata = convert_upstream(args.checkpoint, args.out)
     print(f"{args.out}: {metadata.variant}")
 
 

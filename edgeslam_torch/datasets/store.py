@@ -1,13 +1,11 @@
-"""Recordings fetched into a folder: archives by pooch with downloads that go on, unpacked whole or not at all."""
+"""Recordings fetched into a folder: archives by downloads that go on, unpacked whole or not at all."""
 
 import hashlib
-import importlib
 import json
-import logging
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +14,8 @@ from edgeslam_torch.datasets.catalogue import Archive, Recording
 from edgeslam_torch.datasets.prepare import PREPARED, check_recording
 from edgeslam_torch.datasets.unpack import member_ending, unpack
 from edgeslam_torch.errors import OutputError, SourceError
-from edgeslam_torch.extras import needs_extra
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.files.download import FAILURES, Progress, discard, fetch, reason_of, remember, remembered
+from edgeslam_torch.files.download import DownloadError, Progress, discard, fetch_any, remember, remembered
 from edgeslam_torch.files.plain import subfolder
 
 DOWNLOADS = ".downloads"
@@ -29,8 +26,6 @@ MAX_ARCHIVE_BYTES = 40 << 30
 """Of an archive whose size is not known; the largest known one has 13 GB."""
 _UNPACKED = 1.15
 """Space for an unpacked recording over its archive's size: PNG images hardly shrink, lists and poses are small."""
-_ATTEMPTS = 3
-"""At one address, each going on where the last one broke off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +102,6 @@ def get(
     Raises:
         SourceError: If no address answers, the transfer breaks off, or the checksum differs.
         OutputError: If the disk is full, or the folder cannot be written to.
-        MissingPackageError: Without the ``[data]`` extra.
     """
     try:
         downloads = subfolder(root, DOWNLOADS)
@@ -163,57 +157,28 @@ def _remembered_if_good(archive: Archive, downloads: Path, origin: Origin, given
 
 
 def _download(archive: Archive, target: Path, expected: str | None, progress: Progress) -> str:
-    """Address that the archive came from; it is at ``target`` then."""
-    with needs_extra("data", "edgeslam data get"):
-        pooch = importlib.import_module("pooch")
-    pooch.get_logger().setLevel(logging.WARNING)
-    reasons = []
-    for url in archive.urls:
-        try:
-            pooch.retrieve(url, expected, target.name, target.parent, downloader=_Resuming(archive, progress))
-            return url
-        except _Broken as error:
-            reasons.append(f"{url} ({error})")
-        except ValueError as error:
-            pinned = "" if archive.checksum else f"; if its publisher has replaced it, remove {target}.sha256"
-            raise SourceError(f"{archive.file}: not the expected file; it was deleted ({error}){pinned}") from error
-    raise SourceError(
-        f"{archive.file}: download failed: {'; '.join(reasons)}; the part received is kept; "
-        f"run the same command to resume. If the publisher has moved it, download it by hand and give --archive FILE"
-    )
-
-
-class _Broken(Exception):
-    """A download that may be gone on with."""
-
-
-class _Resuming:
-    """A downloader for pooch that resumes; pooch's own ones restart after every interruption."""
-
-    def __init__(self, archive: Archive, progress: Progress) -> None:
-        self._archive = archive
-        self._progress = progress
-
-    def __call__(self, url: str, output_file: str, pooch: object, check_only: bool = False) -> None:
-        output = Path(output_file)
-        # One partial file per protocol: bytes received over http stay untrusted.
-        part = output.parent / f"{self._archive.file}.{url.split(':')[0]}.part"
-        limit = self._archive.size if self._archive.is_exact else MAX_ARCHIVE_BYTES
-        for attempt in range(1, _ATTEMPTS + 1):
-            had = part.stat().st_size if part.is_file() else 0
-            try:
-                fetch(url, part, limit, self._progress)
-                break
-            except FAILURES as error:
-                gained = part.is_file() and part.stat().st_size > had
-                if attempt == _ATTEMPTS or not gained:
-                    raise _Broken(reason_of(error)) from error
-        size = part.stat().st_size
-        if self._archive.is_exact and size != self._archive.size:
-            discard(part)
-            raise _Broken(f"has {size} bytes instead of {self._archive.size}")
-        part.replace(output)
+    """Address that the archive came from; it is at ``target`` then, verified."""
+    if target.is_file():  # kept, or left by an interruption
+        with suppress(SourceError):
+            _compare(target, expected)
+            return archive.urls[0]
+    size = archive.size if archive.is_exact else 0
+    try:
+        url, part = fetch_any(archive.urls, target, size or MAX_ARCHIVE_BYTES, progress, size)
+    except DownloadError as error:
+        raise SourceError(
+            f"{archive.file}: download failed: {error}; the part received is kept; run the same command to resume. "
+            "If the publisher has moved it, download it by hand and give --archive FILE"
+        ) from error
+    try:
+        _compare(part, expected)
+    except SourceError as error:
         discard(part)
+        pinned = "" if archive.checksum else f"; if its publisher has replaced it, remove {target}.sha256"
+        raise SourceError(f"{archive.file}: not the expected file; it was deleted ({error}){pinned}") from error
+    part.replace(target)
+    discard(part)
+    return url
 
 
 def _compare(path: Path, expected: str | None) -> None:

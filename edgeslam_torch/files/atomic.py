@@ -35,7 +35,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     A link at ``path`` is replaced, not followed.
 
     Raises:
-        OSError: If writing fails, or ``path`` is no plain file; an older file at ``path`` is kept.
+        OSError: With the name ``path``, if writing fails, or it is no plain file; an older file there is kept.
     """
     check_replaceable(path)
     partial = partial_beside(path)
@@ -45,6 +45,10 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)

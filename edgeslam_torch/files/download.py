@@ -7,7 +7,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
@@ -24,6 +24,8 @@ LOWEST_SPEED = 10e3
 WATCHED_S = 60.0
 LONGEST_S = 12 * 3600.0
 """A download that takes longer is resumed by the next call."""
+_ATTEMPTS = 3
+"""At one address, each going on where the last one broke off."""
 USER_AGENT = "edgeslam-torch"
 """Some repositories of universities refuse Python's own."""
 
@@ -88,6 +90,48 @@ def fetch(url: str, part: Path, max_bytes: int, progress: Progress | None = None
                     watched_s, watched = now_s, have
         if total and have < total:
             raise OSError(f"connection lost after {have} of {total} bytes")
+
+
+class DownloadError(Exception):
+    """No address gave the file; the message has the reasons."""
+
+
+def fetch_any(
+    urls: Sequence[str], target: Path, max_bytes: int, progress: Progress | None = None, size: int = 0
+) -> tuple[str, Path]:
+    """Fetch from the first address that gives the file, going on after interruptions.
+
+    Args:
+        urls: Addresses, tried in order.
+        target: The partial files lie beside it, one a protocol: bytes received over http stay untrusted.
+        max_bytes: As for `fetch`.
+        progress: As for `fetch`.
+        size: Exact number of bytes; 0 if unknown.
+
+    Returns:
+        The address, and the partial file, which is whole.
+
+    Raises:
+        DownloadError: If none does; what was received is kept for the next call.
+    """
+    reasons = []
+    for url in urls:
+        part = target.with_name(f"{target.name}.{url.split(':')[0]}.part")
+        for attempt in range(_ATTEMPTS):
+            had = part.stat().st_size if part.is_file() else 0
+            try:
+                fetch(url, part, max_bytes, progress)
+                if size and part.stat().st_size != size:
+                    wrong = f"has {part.stat().st_size} bytes instead of {size}"
+                    discard(part)
+                    raise ValueError(wrong)
+                return url, part
+            except FAILURES as error:
+                gained = part.is_file() and part.stat().st_size > had
+                if attempt + 1 == _ATTEMPTS or not gained:
+                    reasons.append(f"{url} ({reason_of(error)})")
+                    break
+    raise DownloadError("; ".join(reasons))
 
 
 def _answer(request: urllib.request.Request) -> Any:

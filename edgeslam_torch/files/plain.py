@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from edgeslam_torch.errors import EdgeSlamError
+
 _NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 _NO_WAIT = getattr(os, "O_NONBLOCK", 0)
 """A named pipe does not hold up whoever opens it."""
@@ -30,6 +32,30 @@ def open_plain(path: Path) -> BinaryIO:
         os.close(handle)
         raise OSError(errno.EINVAL, "is not a regular file", str(path))
     return os.fdopen(handle, "rb")
+
+
+def read_bounded(path: Path, max_bytes: int, error: type[EdgeSlamError], what: str) -> bytes:
+    """Bytes of a plain file.
+
+    Args:
+        path: The file.
+        max_bytes: Maximum size.
+        error: Exception class to raise.
+        what: What it should be, for the message on its size.
+
+    Raises:
+        EdgeSlamError: ``error``, in one line with the file's name, if it is missing, no plain file or too large.
+    """
+    try:
+        with open_plain(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > max_bytes:
+                raise error(f"{path}: {size / 1e6:.1f} MB is too large for {what}")
+            return file.read()
+    except OSError as reason:
+        raise error(f"{path}: {reason.strerror or reason}") from reason
+    except ValueError as reason:  # no name of a file
+        raise error(f"{path}: {reason}") from reason
 
 
 def check_replaceable(path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.files.plain import read_bounded
 
 MAX_BYTES = {"JSON": 64 << 20, "TOML": 256 << 10, "YAML": 1 << 20}
 """Maximum file size; a benchmark of a thousand runs takes 2 MB, settings and cameras a few kB."""
@@ -70,15 +71,9 @@ def read_mapping(path: Path, kind: str, error: type[EdgeSlamError]) -> dict[str,
     Raises:
         EdgeSlamError: ``error``, with the file's name, if it cannot be read, is malformed, or holds no record.
     """
+    data = read_bounded(path, MAX_BYTES[kind], error, f"{kind} of ours")
     try:
-        if path.exists() and not path.is_file():
-            raise error(f"{path}: not a file")
-        size = path.stat().st_size
-        if size > MAX_BYTES[kind]:
-            raise error(f"{path}: not {kind} of ours ({size / 1e6:.1f} MB)")
-        record = _PARSERS[kind](path.read_text(encoding="utf-8"))
-    except OSError as reason:
-        raise error(f"{path}: {reason.strerror or reason}") from reason
+        record = _PARSERS[kind](data.decode("utf-8"))
     except RecursionError as reason:
         raise error(f"{path}: not valid {kind} (nested too deeply)") from reason
     except ValueError as reason:  # malformed, not UTF-8, or a number with thousands of digits

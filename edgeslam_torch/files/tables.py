@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.files.plain import read_bounded
 from edgeslam_torch.types import FloatArray
 
 MAX_BYTES = 256 << 20
@@ -114,15 +115,7 @@ def read_text(path: Path, error: type[EdgeSlamError], max_bytes: int = MAX_BYTES
     Raises:
         EdgeSlamError: ``error``, if it is no file, cannot be read, is too large, or is no such text.
     """
-    try:
-        if not path.is_file():
-            raise error(f"{path}: no such file" if not path.exists() else f"{path}: not a file")
-        size = path.stat().st_size
-        if size > max_bytes:
-            raise error(f"{path}: {size / 1e6:.0f} MB, more than {max_bytes / 1e6:.0f} MB of a text table are not read")
-        data = path.read_bytes()
-    except OSError as reason:
-        raise error(f"{path}: {reason.strerror or reason}") from reason
+    data = read_bounded(path, max_bytes, error, "a text table")
     encoding = _encoding(data)
     try:
         text = data.decode(encoding)

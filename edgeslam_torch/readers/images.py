@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.files.plain import read_bounded
 from edgeslam_torch.files.time_units import UNKNOWN, is_date, seconds_of
 from edgeslam_torch.readers.image_size import image_size
 from edgeslam_torch.readers.levels import Levels, levels_of
@@ -150,17 +151,7 @@ def check_trackable(size: tuple[int, int], name: str | Path) -> None:
 
 
 def _bytes(path: Path) -> bytes:
-    try:
-        size = path.stat().st_size if path.is_file() else None
-        if size is not None and size > _MAX_BYTES:
-            raise SourceError(f"{path}: {size / 1e6:.0f} MB is too large for an image")
-        data = path.read_bytes() if size is not None else None
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror or error}") from error
-    if data is None:
-        raise SourceError(f"{path}: no such file")
-    if not data:
-        raise SourceError(f"{path}: empty file")
+    data = read_bounded(path, _MAX_BYTES, SourceError, "an image")
     _check_bytes(data, path)
     return data
 

@@ -110,22 +110,18 @@ class TelemetryTable:
         return said
 
 
-def read_telemetry(path: Path, units: TelemetryUnits | None = None) -> tuple[list[TelemetrySample], list[str]]:
+def read_telemetry(path: Path) -> tuple[list[TelemetrySample], list[str]]:
     """Telemetry of a flight in SI units, in time order, and warnings about the file.
 
     Args:
-        path: Our ``telemetry.csv`` or another log with a header line.
-        units: How to read the velocities; default: `detect_units`.
+        path: Our ``telemetry.csv`` or another log with a header line; `detect_units` tells how to read its velocities.
 
     Raises:
         TelemetryError: If the file is not there, is not text, or has no clock or no known column.
     """
     table = read_table(path)
-    if units is None:
-        units = detect_units(table)
-        logger.info(
-            "%s: velocities: %s; %s", path, units.evidence, units.frame_evidence or "frame: SDK default (world)"
-        )
+    units = detect_units(table)
+    logger.info("%s: velocities: %s; %s", path, units.evidence, units.frame_evidence or "frame: SDK default (world)")
     return table.samples(units), [*table.warnings(path.name), *_assumed_units(table, units, path.name)]
 
 

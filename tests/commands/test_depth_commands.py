@@ -17,6 +17,7 @@ from small_networks import FAR_M, NEAR_M, RELATIVE, describe, green_network
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.errors import ConfigError, EdgeSlamError
+from edgeslam_torch.files import download
 from edgeslam_torch.frontend.depth_network import DepthPredictor
 from edgeslam_torch.frontend.external_depth import ExternalDepth
 from edgeslam_torch.geometry.camera import Camera
@@ -168,7 +169,6 @@ def test_weights_list_inspect_convert(tmp_path, capsys, monkeypatch):
 
 def test_download_says_how_far_a_file_can_be_trusted(tmp_path, capsys, monkeypatch):
     """First, again, changed: with a file in the server's place."""
-    from edgeslam_torch.models import download as module
 
     def fetch(url, part, max_bytes, progress):
         part.write_bytes(content)
@@ -176,7 +176,7 @@ def test_download_says_how_far_a_file_can_be_trusted(tmp_path, capsys, monkeypat
     torch.save(FastDepth(Variant.PRUNED).state_dict(), tmp_path / "plain.pth")
     content = (tmp_path / "plain.pth").read_bytes()
     monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(module, "fetch", fetch)
+    monkeypatch.setattr(download, "fetch", fetch)
     name = "mobilenet-nnconv5dw-skipadd-pruned"
     run("weights", "download", name)
     assert "trusted on first use" in capsys.readouterr().out
@@ -188,10 +188,8 @@ def test_download_says_how_far_a_file_can_be_trusted(tmp_path, capsys, monkeypat
 
 
 def test_a_description_of_a_network_replaces_no_file_of_others(tmp_path, monkeypatch):
-    from edgeslam_torch.models import download as module
-
     monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(module, "fetch", lambda *given: pytest.fail("fetched"))
+    monkeypatch.setattr(download, "fetch", lambda *given: pytest.fail("fetched"))
     (tmp_path / "settings.toml").write_text("precious")
     out = tmp_path / "settings.onnx"
     assert main(["weights", "download", "depth-anything-v2-small", "--out", str(out)]) == 1
@@ -210,10 +208,8 @@ def test_two_images_of_one_name_are_two_depth_maps(weights, pictures, tmp_path):
 
 
 def test_a_download_that_is_no_network_is_not_remembered(tmp_path, monkeypatch):
-    from edgeslam_torch.models import download as module
-
     monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path))
-    monkeypatch.setattr(module, "fetch", lambda url, part, *_: part.write_bytes(b"<html>not found</html>"))
+    monkeypatch.setattr(download, "fetch", lambda url, part, *_: part.write_bytes(b"<html>not found</html>"))
     with pytest.raises(EdgeSlamError, match="checkpoint"):
         run("weights", "download", "mobilenet-nnconv5")
     assert not list(tmp_path.glob("*.sha256"))

@@ -10,10 +10,8 @@ from published import png, tgz, zipped
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.datasets import catalogue, consent, store
-from edgeslam_torch.files.download import USER_AGENT
+from edgeslam_torch.files import download
 from edgeslam_torch.readers.source import open_source
-
-pytest.importorskip("pooch", reason="needs the [data] extra: pooch is not installed")
 
 
 def tum(count=4, name="rgbd_dataset_freiburg1_xyz"):
@@ -78,7 +76,7 @@ def test_recording_is_ready_to_run_and_says_where_it_comes_from(one, publisher, 
     origin = json.loads((tmp_path / "rec" / "tum_fr1_a" / ".origin.json").read_text())
     assert (origin["licence"], origin["sha256"]) == ("L", sha256(content))
     assert [p.name for p in (tmp_path / "rec" / ".downloads").iterdir()] == ["a.tgz.sha256"], "the archive is gone"
-    assert publisher.agents == {USER_AGENT}, "some servers refuse Python's own"
+    assert publisher.agents == {download.USER_AGENT}, "some servers refuse Python's own"
 
 
 @pytest.mark.parametrize("changed", [None, tum(6)])
@@ -88,7 +86,7 @@ def test_broken_download_goes_on_in_the_next_call_or_begins_anew_if_the_file_cha
     one(tum())
     publisher.breaks["/a.tgz"] = 1000
     part = tmp_path / "rec" / ".downloads" / "a.tgz.http.part"
-    content, fetch = publisher.files["/a.tgz"], store.fetch
+    content, fetch = publisher.files["/a.tgz"], download.fetch
 
     def vanish(url, part, most, progress):  # the publisher is gone after the first piece
         try:
@@ -97,7 +95,7 @@ def test_broken_download_goes_on_in_the_next_call_or_begins_anew_if_the_file_cha
             publisher.files.pop("/a.tgz", None)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store, "fetch", vanish)
+        patch.setattr(download, "fetch", vanish)
         assert get(tmp_path, "tum_fr1_a") == 1
     assert "run the same command to resume" in capsys.readouterr().err
     assert part.stat().st_size == 1000

@@ -57,12 +57,8 @@ def server():
 
 
 def test_broken_transfer_goes_on_where_it_stopped(server, tmp_path):
-    with pytest.raises(WeightsError, match="run it again"):
-        download((f"{server}/short",), tmp_path / "w")
-    assert not (tmp_path / "w").exists()
-    assert 0 < (tmp_path / "w.http.part").stat().st_size < len(CONTENT)
     download((f"{server}/short",), tmp_path / "w", hashlib.sha256(CONTENT).hexdigest())
-    assert (tmp_path / "w").read_bytes() == CONTENT
+    assert _Handler.interrupted and (tmp_path / "w").read_bytes() == CONTENT
 
 
 def test_wrong_checksum_leaves_nothing(server, tmp_path):

@@ -3,11 +3,9 @@
 import argparse
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from edgeslam_torch.errors import OutputError
+from edgeslam_torch.commands.shared import add_set
 from edgeslam_torch.files.output_file import output_file
 
 
@@ -19,9 +17,7 @@ def add_runs_to(parser: argparse.ArgumentParser, seeds: int) -> None:
         "--sequence", action="append", default=[], metavar="NAME", help="only this one; may be repeated"
     )
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change a setting of all runs"
-    )
+    add_set(parser)
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="results; finished runs are not repeated (default: runs/NAME-TIME)"
     )
@@ -36,16 +32,3 @@ def recordings(given: Path | None) -> Path | None:
 def say(text: str) -> None:
     """One line of progress."""
     sys.stderr.write(text + "\n")
-
-
-@contextmanager
-def writing() -> Iterator[None]:
-    """Turn an operating system's error into one line.
-
-    Raises:
-        OutputError: If a file cannot be written.
-    """
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error

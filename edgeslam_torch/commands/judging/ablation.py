@@ -4,7 +4,7 @@ import argparse
 import time
 from pathlib import Path
 
-from edgeslam_torch.commands.judging._common import add_runs_to, recordings, say, writing
+from edgeslam_torch.commands.judging._common import add_runs_to, recordings, say
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_text
 
@@ -26,11 +26,10 @@ def main(args: argparse.Namespace) -> int:
     seeds = tuple(range(max(1, args.seeds)))
     settings = BenchSettings(data, seeds, tuple(args.sequence), args.max_frames, overrides=tuple(args.set), min_hz=0.0)
     out = args.out or Path("runs") / time.strftime("ablation-%Y%m%d-%H%M%S")
-    with writing():
-        record = run_ablation(settings, args.row, out, say)
-        text = markdown_ablation(record)
-        if args.markdown is not None:
-            write_text(args.markdown, text)
+    record = run_ablation(settings, args.row, out, say)
+    text = markdown_ablation(record)
+    if args.markdown is not None:
+        write_text(args.markdown, text)
     print(text)
     print(f"results: {out / 'ablation.json'}")
     return 1 if any(run["error"] for row in record["rows"].values() for run in row["runs"]) else 0

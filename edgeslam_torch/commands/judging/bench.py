@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from edgeslam_torch.commands.judging._common import add_runs_to, recordings, say, writing
+from edgeslam_torch.commands.judging._common import add_runs_to, recordings, say
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.output_file import output_file
@@ -87,18 +87,17 @@ def main(args: argparse.Namespace) -> int:
     if data is None:
         say("no recordings (--data or EDGESLAM_DATA): the synthetic flight alone")
     out = args.out or Path("runs") / time.strftime("bench-%Y%m%d-%H%M%S")
-    with writing():
-        if args.depth:
-            result: dict[str, Any] = rows.compare_networks(settings, args.depth, out, say)
-            runs = [run for record in result.values() for run in record["runs"]]
-            text = rows.markdown_networks(result)
-        else:
-            result = benchmark.run_benchmark(settings, out, say)
-            runs, text = result["runs"], benchmark.markdown_bench(result)
-        if args.json is not None:
-            write_text(args.json, json.dumps(result, indent=1, default=str) + "\n")
-        if args.markdown is not None:
-            write_text(args.markdown, text)
+    if args.depth:
+        result: dict[str, Any] = rows.compare_networks(settings, args.depth, out, say)
+        runs = [run for record in result.values() for run in record["runs"]]
+        text = rows.markdown_networks(result)
+    else:
+        result = benchmark.run_benchmark(settings, out, say)
+        runs, text = result["runs"], benchmark.markdown_bench(result)
+    if args.json is not None:
+        write_text(args.json, json.dumps(result, indent=1, default=str) + "\n")
+    if args.markdown is not None:
+        write_text(args.markdown, text)
     print(text)
     if not args.depth:
         print(f"results: {out / 'bench.json'}")
@@ -142,8 +141,7 @@ def _navigation(args: argparse.Namespace) -> int:
     ]
     if not cases:
         raise ConfigError(f"--behaviour corridor: none of {', '.join(worlds)} is a corridor")
-    with writing():
-        flights = judge_flights(cases, out, args.jobs, say)
+    flights = judge_flights(cases, out, args.jobs, say)
     print(markdown(flights))
     print(f"results: {out / 'navigation.md'}")
     return 1 if any(flown.contacts or flown.ended.startswith(FAILED) for flown in flights) else 0

@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 
 from edgeslam_torch.commands.judging.eval import groundtruth_of, one_groundtruth
-from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.output_file import output_file
 
@@ -47,8 +46,5 @@ def main(args: argparse.Namespace) -> int:
     print(report_of_two(first, second))
     print(common_report(common))
     if args.json is not None:
-        try:
-            write_text(args.json, json.dumps([first.to_dict(), second.to_dict()], indent=1, default=str) + "\n")
-        except OSError as error:
-            raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
+        write_text(args.json, json.dumps([first.to_dict(), second.to_dict()], indent=1, default=str) + "\n")
     return 0

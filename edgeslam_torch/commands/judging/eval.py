@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgeslam_torch.errors import ConfigError, EdgeSlamError, OutputError
+from edgeslam_torch.errors import ConfigError, EdgeSlamError
 from edgeslam_torch.extras import needs_extra
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.output_file import add_overwrite_to, check_new, output_file
@@ -99,12 +99,12 @@ def main(args: argparse.Namespace) -> int:
     common = _common(args, scores, judged) if args.common_frames and len(scores) > 1 else None
     to_print = args.markdown == Path("-")
     print(_text(scores, common, markdown=to_print))
-    try:
-        if args.markdown is not None and not to_print:
-            write_text(args.markdown, _text(scores, common, markdown=True))
-        _write_files(args, scores, judged)
-    except OSError as error:
-        raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
+    if args.markdown is not None and not to_print:
+        write_text(args.markdown, _text(scores, common, markdown=True))
+    if args.json is not None:
+        write_text(args.json, json.dumps([s.to_dict() for s in scores], indent=1, default=str) + "\n")
+    if args.plots is not None:
+        _plot(args.plots, scores, judged, args.overwrite)
     return 1 if failures else 0
 
 
@@ -178,22 +178,12 @@ def _depth_maps(args: argparse.Namespace) -> int:
         reports = {str(run): compare_folders(run, truth, 1.0 / args.depth_unit, args.images) for run in args.runs}
     text = "\n".join(f"{name}\n\n{depth_report(report)}\n" for name, report in reports.items())
     print(text)
-    try:
-        if args.markdown is not None:
-            write_text(args.markdown, text)
-        if args.json is not None:
-            records = {k: {n: asdict(v[n]) if n in v else None for n in TITLES} for k, v in reports.items()}
-            write_text(args.json, json.dumps(records, indent=1) + "\n")
-    except OSError as error:
-        raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
-    return 0
-
-
-def _write_files(args: argparse.Namespace, scores: "list[RunScore]", judged: list[tuple[Path, Path]]) -> None:
+    if args.markdown is not None:
+        write_text(args.markdown, text)
     if args.json is not None:
-        write_text(args.json, json.dumps([s.to_dict() for s in scores], indent=1, default=str) + "\n")
-    if args.plots is not None:
-        _plot(args.plots, scores, judged, args.overwrite)
+        records = {k: {n: asdict(v[n]) if n in v else None for n in TITLES} for k, v in reports.items()}
+        write_text(args.json, json.dumps(records, indent=1) + "\n")
+    return 0
 
 
 def _plot(folder: Path, scores: "list[RunScore]", judged: list[tuple[Path, Path]], overwrite: bool) -> None:

@@ -4,7 +4,8 @@ import argparse
 import json
 from pathlib import Path
 
-from edgeslam_torch.commands.judging._common import recordings, say, writing
+from edgeslam_torch.commands.judging._common import recordings, say
+from edgeslam_torch.commands.shared import add_set
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.output_file import add_overwrite_to, check_new, check_not_read
@@ -31,9 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes at a time (default: 2)")
     parser.add_argument("--timeout", type=float, default=900.0, metavar="S", help="longest cell [s] (default: 900)")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting of every run"
-    )
+    add_set(parser)
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="results; finished cells are not repeated"
     )
@@ -77,18 +76,17 @@ def main(args: argparse.Namespace) -> int:
     else:
         cells = list_cells(data, args.cells, range(args.first_seed, args.first_seed + args.seeds), args.only)
     settings = JudgeSettings(tuple(args.set), args.max_frames, args.jobs, args.timeout, args.flights)
-    with writing():
-        record = judge(cells, settings, args.out, say)
-        text = markdown(record, thresholds)
-        if before is not None:
-            text += "\n" + compared(before, record, "rows", "cell", COLUMNS)
-        write_text(args.out / RECORD, json.dumps(record, indent=1) + "\n")
-        write_text(args.out / TABLE, text)
-        if args.release is not None:
-            assert data is not None
-            outputs = command_outputs(data, args.out, record["commit"], say)
-            release = release_record(record["rows"], record["commit"], outputs)
-            write_text(args.release, json.dumps(release, indent=1) + "\n")
+    record = judge(cells, settings, args.out, say)
+    text = markdown(record, thresholds)
+    if before is not None:
+        text += "\n" + compared(before, record, "rows", "cell", COLUMNS)
+    write_text(args.out / RECORD, json.dumps(record, indent=1) + "\n")
+    write_text(args.out / TABLE, text)
+    if args.release is not None:
+        assert data is not None
+        outputs = command_outputs(data, args.out, record["commit"], say)
+        release = release_record(record["rows"], record["commit"], outputs)
+        write_text(args.release, json.dumps(release, indent=1) + "\n")
     print(text)
     print(f"results: {args.out / RECORD}")
     return 1 if any(row["error"] for row in record["rows"]) else 0

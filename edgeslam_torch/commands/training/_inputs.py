@@ -4,7 +4,6 @@ import argparse
 import logging
 import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
+from edgeslam_torch.commands import shared
 from edgeslam_torch.errors import ConfigError, SourceError
 from edgeslam_torch.files.plain import subfolder
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-EXIT_INTERRUPTED = 130
 MAX_THREADS = 256
 """Tens of thousands crash OpenMP."""
 
@@ -209,8 +208,8 @@ def in_folder(args: argparse.Namespace, work: "Callable[[OutFolder], TrainingRes
                 outcome = work(out)
             except KeyboardInterrupt:
                 if rank == 0:
-                    sys.stderr.write(f"edgeslam: interrupted; {_left(out)}\n")
-                return EXIT_INTERRUPTED
+                    shared.say(f"interrupted; {_left(out)}")
+                return shared.EXIT_INTERRUPTED
     if rank == 0:
         print(outcome.describe())
     return 0
