@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgeslam_torch.commands.shared import EXIT_INTERRUPTED, add_settings, resolved_config, say
 from edgeslam_torch.errors import ConfigError, SourceError
+from edgeslam_torch.help.options import EXIT_INTERRUPTED, add_settings, say
 
 if TYPE_CHECKING:
     from edgeslam_torch.eval.experiment.runner import Runner
@@ -87,6 +87,7 @@ def _without(flights: "list[Flight]", out: Path) -> "list[Flight]":
 
 
 def _settings(args: argparse.Namespace) -> "BatchSettings":
+    from edgeslam_torch.commands.run import resolved_config
     from edgeslam_torch.fleet.folder import BatchSettings
 
     if args.depth is not None and os.path.exists(args.depth):

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from edgeslam_torch.commands.shared import EXIT_INTERRUPTED, say
+from edgeslam_torch.help.options import EXIT_INTERRUPTED, say
 
 _CHECKSUM = {"publisher": "checksum by its publisher", "agreed": "checksum recorded by independent projects"}
 

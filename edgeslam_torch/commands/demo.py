@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgeslam_torch.commands.shared import EXIT_INTERRUPTED, add_settings, check_tracked, resolved_config, write_page
+from edgeslam_torch.help.options import EXIT_INTERRUPTED, add_settings
 
 if TYPE_CHECKING:
     from edgeslam_torch.demo import DemoResult, DemoSettings
@@ -52,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run the demo and print the results."""
+    from edgeslam_torch.commands.run import check_tracked, resolved_config, write_page
     from edgeslam_torch.demo import SCORE, record, run_and_judge
     from edgeslam_torch.terminal.run_progress import RunProgress
     from edgeslam_torch.writers.own_folder import check_free

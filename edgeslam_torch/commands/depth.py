@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edgeslam_torch.commands.shared import positive_number
 from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.files.output_file import add_overwrite_to, check_new
+from edgeslam_torch.help.options import positive_number
 
 if TYPE_CHECKING:
     from edgeslam_torch.geometry.camera import Camera

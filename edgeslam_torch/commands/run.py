@@ -8,18 +8,8 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgeslam_torch.commands.shared import (
-    EXIT_INTERRUPTED,
-    add_settings,
-    add_topic,
-    check_tracked,
-    positive_number,
-    resolved_config,
-    say,
-    whole_number,
-    write_page,
-)
 from edgeslam_torch.files.output_file import output_file
+from edgeslam_torch.help.options import EXIT_INTERRUPTED, add_settings, add_topic, positive_number, say, whole_number
 
 if TYPE_CHECKING:
     from edgeslam_torch.atlas.saved import SavedAtlas
@@ -101,7 +91,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run, and print a short summary."""
-    from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.atlas.atlas_file import check_fits, read_atlas
+    from edgeslam_torch.errors import ConfigError, OutputError
     from edgeslam_torch.run import AtlasFiles, Listener, Mode, run, settle_camera
     from edgeslam_torch.terminal.run_progress import RunProgress
 
@@ -111,12 +102,12 @@ def main(args: argparse.Namespace) -> int:
     _check_atlas_can_be_saved(args.save_atlas)
     with ExitStack() as files:
         progress = files.enter_context(RunProgress("opening the source", args.progress))
-        earlier = _earlier_flights(args.atlas)
+        earlier = None if args.atlas is None else read_atlas(args.atlas)
         source = _source(args)
         if earlier is None or not _take_its_camera(source, earlier):
             settle_camera(source)
         if earlier is not None:
-            _check_fits(earlier, source, config, args.atlas)
+            check_fits(earlier, source.camera, config.orb.scale_factor, args.atlas, config.orb.levels)
         for warning in source.warnings:
             say(f"warning: {warning}")
         say(_camera_words(source.camera))
@@ -149,8 +140,6 @@ def main(args: argparse.Namespace) -> int:
             progress.phase("making the report")
             write_page(result)
     _report(result, source)
-    from edgeslam_torch.errors import OutputError
-
     if result.failure is not None:
         frames = result.summary["frames"]
         raise OutputError(f"{result.failure}; what the folder holds is valid, up to frame {frames}")
@@ -203,15 +192,6 @@ def _recorded(args: argparse.Namespace) -> "Source":
     return RecordedLive(open_live(args.source, args.camera, args.max_frames), [], args.record, args.lossless)
 
 
-def _earlier_flights(path: Path | None) -> "SavedAtlas | None":
-    """The atlas to fly in."""
-    if path is None:
-        return None
-    from edgeslam_torch.atlas.atlas_file import read_atlas
-
-    return read_atlas(path)
-
-
 def _take_its_camera(source: "Source", atlas: "SavedAtlas") -> bool:
     """Give a source of unknown focal length the camera of the atlas, if its images have the same size."""
     camera = source.camera
@@ -221,12 +201,6 @@ def _take_its_camera(source: "Source", atlas: "SavedAtlas") -> bool:
         return False
     source.camera = replace(atlas.camera, source=f"{atlas.camera.source}, as in the atlas")
     return True
-
-
-def _check_fits(atlas: "SavedAtlas", source: "Source", config: "SlamConfig", path: Path) -> None:
-    from edgeslam_torch.atlas.atlas_file import check_fits
-
-    check_fits(atlas, source.camera, config.orb.scale_factor, path, config.orb.levels)
 
 
 def _check_atlas_can_be_saved(path: Path | None) -> None:
@@ -261,6 +235,48 @@ def _atlas_words(summary: dict[str, Any]) -> list[str]:
         flights = f"{saved['flights']} flight{'s' if saved['flights'] > 1 else ''}"
         lines.append(f"atlas saved: {saved['keyframes']} keyframes, {saved['anchors']} anchors, {flights}")
     return lines
+
+
+def resolved_config(args: argparse.Namespace) -> "SlamConfig":
+    """Defaults overridden by ``--config``, ``--set`` and named options, in this order."""
+    from edgeslam_torch.config import SlamConfig
+    from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.files.config_file import load_config
+
+    config = load_config(SlamConfig(), args.config, args.set)
+    if args.seed is not None:
+        try:
+            config = replace(config, seed=args.seed)
+        except ValueError as error:
+            raise ConfigError(f"--seed: {error}") from error
+    given = {name: value for name, value in (("weights", args.depth), ("device", args.device)) if value is not None}
+    return replace(config, depth=replace(config.depth, **given))
+
+
+def check_tracked(result: "RunResult") -> None:
+    """A run that tracked nothing is no success.
+
+    Raises:
+        SourceError: If no frame was tracked.
+    """
+    from edgeslam_torch.errors import SourceError
+
+    if not result.summary["tracked"]:
+        raise SourceError(
+            f"no frame was tracked against a map ({result.summary['last_reason'] or 'no reason known'}): the poses in "
+            f"{result.folder} are guesses; the camera must move sideways, up or down, and see something with texture"
+        )
+
+
+def write_page(result: "RunResult") -> None:
+    """``report.html``; failure to make the page does not fail the run."""
+    from edgeslam_torch.errors import EdgeSlamError
+    from edgeslam_torch.eval.report.page import write_report
+
+    try:
+        write_report(result.folder, judge_map=False)
+    except (EdgeSlamError, OSError, ValueError) as error:
+        say(f"warning: report.html could not be made ({error})")
 
 
 def _report(result: "RunResult", source: "Source") -> None:

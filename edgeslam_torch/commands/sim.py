@@ -4,10 +4,6 @@ import argparse
 import math
 import signal
 import time
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from edgeslam_torch.synthetic.sites.site import Site
 
 _POLL_S = 0.1
 """A signal delivered to another thread does not wake the main thread, which handles it."""
@@ -55,6 +51,7 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.drone.emulator.room import drone_at, furnished_drone
     from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
     from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.synthetic.sites.build import named_site
 
     if args.measure is not None:
         return _measure(args)
@@ -82,7 +79,7 @@ def main(args: argparse.Namespace) -> int:
     if args.world is None:
         drone, paint, _ = furnished_drone(args.seed, tilt, size, charge)
     else:
-        drone, paint, _ = drone_at(_site(args.world, args.seed), tilt, size, charge)
+        drone, paint, _ = drone_at(named_site(args.world, args.seed), tilt, size, charge)
     drone.air = Air(np.array([0.0, args.wind, 0.0]), 0.5 * args.wind, np.random.default_rng(args.seed))
     drone.battery_per_s = 1.0 / (60.0 * args.drain)
     signals: list[int] = []
@@ -115,12 +112,6 @@ def _address(args: argparse.Namespace, command_port: int) -> str:
     host = "127.0.0.1" if args.bind == "0.0.0.0" else args.bind
     ports = (command_port, args.state_port, args.video_port)
     return f"tello://{host}" + ("" if ports == (8889, 8890, 11111) else ":{}:{}:{}".format(*ports))
-
-
-def _site(name: str, seed: int) -> "Site":
-    from edgeslam_torch.synthetic.sites.build import named_site
-
-    return named_site(name, seed)
 
 
 def _measure(args: argparse.Namespace) -> int:

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from edgeslam_torch.commands.shared import add_topic
+from edgeslam_torch.help.options import add_topic
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

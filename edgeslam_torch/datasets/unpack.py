@@ -7,11 +7,11 @@ import struct
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import IO
+from typing import IO, Any, cast
 
 from edgeslam_torch.errors import SourceError
 
@@ -40,7 +40,8 @@ class _Member:
 
     parts: tuple[str, ...]
     size: int
-    handle: zipfile.ZipInfo | tarfile.TarInfo
+    handle: Any
+    """The archive's own record of it."""
 
 
 def unpack(archive: Path, inside: str, folder: Path) -> int:
@@ -136,55 +137,35 @@ class _TarInfo(tarfile.TarInfo):
         return super()._proc_member(archive)  # type: ignore[misc]
 
 
-class _Reader:
-    """Reads members of an open archive."""
-
-    def __init__(self, archive: zipfile.ZipFile | tarfile.TarFile) -> None:
-        self._archive = archive
-
-    def __call__(self, member: _Member) -> IO[bytes]:
-        if isinstance(self._archive, zipfile.ZipFile):
-            assert isinstance(member.handle, zipfile.ZipInfo)
-            return self._archive.open(member.handle)
-        assert isinstance(member.handle, tarfile.TarInfo)
-        file = self._archive.extractfile(member.handle)
-        assert file is not None, "regular files have content"
-        return file
-
-
 @contextmanager
-def _opened(archive: Path) -> Iterator[tuple[list[_Member], _Reader]]:
+def _opened(archive: Path) -> Iterator[tuple[list[_Member], Callable[[_Member], IO[bytes]]]]:
     """Checked members of an archive, and how to read them."""
     try:
         if zipfile.is_zipfile(archive):
-            with zipfile.ZipFile(archive) as opened:
-                yield _checked(archive, [_of_zip(archive, info) for info in opened.infolist()]), _Reader(opened)
+            with zipfile.ZipFile(archive) as zipped:  # kind 8: a regular file, 10: a symbolic link
+                members = [
+                    _member(archive, info.filename, info.external_attr >> 28 in (0, 8), info.file_size, info)
+                    for info in zipped.infolist()
+                    if not info.is_dir()
+                ]
+                yield _checked(archive, members), lambda member: zipped.open(member.handle)
         else:
-            with tarfile.open(archive, tarinfo=_TarInfo) as opened:
-                files = _checked(archive, (_of_tar(archive, info) for info in opened))
-                _read_rest(opened)
-                yield files, _Reader(opened)
+            with tarfile.open(archive, tarinfo=_TarInfo) as tar:
+                inside = (info for info in tar if not info.isdir())
+                files = _checked(archive, (_member(archive, i.name, i.isreg(), i.size, i) for i in inside))
+                while tar.fileobj is not None and tar.fileobj.read(1 << 20):
+                    pass  # to the end of the stream, where the checksum of the whole is
+                yield files, lambda member: cast(IO[bytes], tar.extractfile(member.handle))
     except (*_DAMAGED, OSError) as error:
         if isinstance(error, OSError) and error.errno not in _DAMAGED_ERRNO:
             raise
         raise SourceError(f"{archive}: damaged, or no archive ({' '.join(str(error).split())[:120]})") from error
 
 
-def _of_zip(archive: Path, info: zipfile.ZipInfo) -> _Member | None:
-    kind = info.external_attr >> 28
-    if info.is_dir():
-        return None
-    if kind not in (0, 8):  # 8: a regular file, 10: a symbolic link
-        raise SourceError(f"{archive}: {info.filename[:80]!r} is a link or a device; nothing was unpacked")
-    return _Member(_parts(archive, info.filename), info.file_size, info)
-
-
-def _of_tar(archive: Path, info: tarfile.TarInfo) -> _Member | None:
-    if info.isdir():
-        return None
-    if not info.isreg():
-        raise SourceError(f"{archive}: {info.name[:80]!r} is a link or a device; nothing was unpacked")
-    return _Member(_parts(archive, info.name), info.size, info)
+def _member(archive: Path, name: str, is_file: bool, size: int, handle: Any) -> _Member:
+    if not is_file:
+        raise SourceError(f"{archive}: {name[:80]!r} is a link or a device; nothing was unpacked")
+    return _Member(_parts(archive, name), size, handle)
 
 
 def _parts(archive: Path, name: str) -> tuple[str, ...]:
@@ -196,19 +177,11 @@ def _parts(archive: Path, name: str) -> tuple[str, ...]:
     return parts
 
 
-def _read_rest(archive: tarfile.TarFile) -> None:
-    """Read a tar to the end of its stream, where the checksum of the whole is."""
-    while archive.fileobj is not None and archive.fileobj.read(1 << 20):
-        pass
-
-
-def _checked(archive: Path, members: Iterable[_Member | None]) -> list[_Member]:
+def _checked(archive: Path, members: Iterable[_Member]) -> list[_Member]:
     """The files, if they are no more than a recording has; the others of a bomb are not looked at."""
     files: list[_Member] = []
     size, most = 0, MAX_GROWTH * archive.stat().st_size + (16 << 20)
     for member in members:
-        if member is None:
-            continue
         size += member.size
         if not any(part in _JUNK for part in member.parts):
             files.append(member)

@@ -37,8 +37,15 @@ def load_config(default: C, path: Path | None, overrides: Sequence[str] = ()) ->
         origin = f"--set {_cut(text)}"
         if not equals or not key.strip():
             raise ConfigError(f"{origin}: write it as section.key=value")
-        config = _override(config, key.strip(), value.strip(), origin)
+        record: Any = _Text(value.strip())
+        for name in reversed(key.strip().split(".")):
+            record = {name: record}
+        config = laid_over(config, record, origin)
     return config
+
+
+class _Text(str):
+    """A value as the command line has it; its field says what it is."""
 
 
 def to_toml(config: Any) -> str:
@@ -86,33 +93,20 @@ def laid_over(config: C, record: Mapping[str, Any], origin: str, prefix: str = "
     for name, value in record.items():
         key = prefix + name
         if name not in hints:
-            raise ConfigError(f"{origin}: {_unknown(key, keys_of(config, prefix), dataclasses.is_dataclass(value))}")
+            while isinstance(value, dict) and len(value) == 1:
+                (name, value), *_ = value.items()
+                key = f"{key}.{name}"
+            raise ConfigError(f"{origin}: {_unknown(key, keys_of(config, prefix))}")
         current = getattr(config, name)
         if dataclasses.is_dataclass(current):
             if not isinstance(value, dict):
-                raise ConfigError(f"{origin}: {key} is a section; write [{key}] and its keys below")
+                inside = ", ".join(field.name for field in dataclasses.fields(current))
+                raise ConfigError(f"{origin}: {key} is a section; its keys are {inside}")
             changes[name] = laid_over(current, value, origin, f"{key}.")
         else:
-            changes[name] = _checked(value, hints[name], key, origin)
+            parsed = _parsed(value, hints[name]) if isinstance(value, _Text) else value
+            changes[name] = _checked(parsed, hints[name], key, origin)
     return _replaced(config, changes, origin, prefix)
-
-
-def _override(config: C, key: str, text: str, origin: str, prefix: str = "") -> C:
-    """``config`` with one dotted key parsed from text."""
-    name, dot, rest = key.partition(".")
-    hints = typing.get_type_hints(type(config))
-    if name not in hints:
-        raise ConfigError(f"{origin}: {_unknown(prefix + key, keys_of(config, prefix))}")
-    current = getattr(config, name)
-    if dataclasses.is_dataclass(current):
-        if not dot:
-            inside = ", ".join(field.name for field in dataclasses.fields(current))
-            raise ConfigError(f"{origin}: {prefix + name} is a section; its keys are {inside}")
-        return _replaced(config, {name: _override(current, rest, text, origin, f"{prefix}{name}.")}, origin, prefix)
-    if dot:
-        raise ConfigError(f"{origin}: {prefix + name} is a value, not a section")
-    value = _checked(_parsed(text, hints[name]), hints[name], prefix + name, origin)
-    return _replaced(config, {name: value}, origin, prefix)
 
 
 def _replaced(config: C, changes: dict[str, Any], origin: str, prefix: str) -> C:
@@ -129,7 +123,7 @@ def _parsed(text: str, hint: Any) -> Any:
     """A value from the command line: TOML, or a bare word for strings."""
     if str in _options(hint) or any(isinstance(option, str) for option in _options(hint)):
         quoted = len(text) >= 2 and text[0] == text[-1] and text[0] in "\"'"
-        return text[1:-1] if quoted else text
+        return str(text[1:-1] if quoted else text)
     if type(None) in _options(hint) and text.lower() in ("none", "null", ""):
         return None
     low = text.lower()
@@ -137,7 +131,7 @@ def _parsed(text: str, hint: Any) -> Any:
     try:
         return tomllib.loads(f"value = {candidate}")["value"]
     except (ValueError, RecursionError):
-        return text
+        return str(text)
 
 
 def _checked(value: Any, hint: Any, key: str, origin: str) -> Any:
@@ -220,9 +214,9 @@ def _describe(hint: Any) -> str:
     return " or ".join(words)
 
 
-def _unknown(key: str, known: Sequence[str], is_section: bool = False) -> str:
+def _unknown(key: str, known: Sequence[str]) -> str:
     close = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
-    if not close and not is_section:  # the right name in the wrong section
+    if not close:  # the right name in the wrong section
         close = [candidate for candidate in known if candidate.split(".")[-1] == key.split(".")[-1]][:1]
     hint = f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(known[:8])}, ..."
     return f"unknown key {key!r}{hint}"

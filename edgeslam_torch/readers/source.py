@@ -1,8 +1,6 @@
 """`open_source`: a recording, an image folder, a video or a live stream as frames with a camera."""
 
 import difflib
-import importlib
-import importlib.util
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,14 +26,7 @@ from edgeslam_torch.types import Frame, TelemetrySample
 
 LIVE_SCHEMES = ("tello://", "webcam:", "rtsp://", "udp://", "http://", "https://", "gst:")
 
-ARCHIVES = {
-    ".zip": "an archive: unpack it first",
-    ".tgz": "an archive: unpack it first",
-    ".gz": "an archive: unpack it first",
-    ".tar": "an archive: unpack it first",
-    ".7z": "an archive: unpack it first",
-}
-
+ARCHIVES = (".zip", ".tgz", ".gz", ".tar", ".7z")
 _FEW = 3
 """Fewer images are no recording: a calibration's vignette, a title picture."""
 PANORAMAS = (".insv", ".360")
@@ -286,7 +277,7 @@ def _file_content(path: Path) -> _Content:
     if suffix in images.SUFFIXES:
         return _listed(ImageSequence("images", path.parent, (ImageEntry(0, 0.0, path),)), path)
     if suffix in ARCHIVES:
-        raise SourceError(f"{path}: {ARCHIVES[suffix]}, then give the folder")
+        raise SourceError(f"{path}: an archive: unpack it first, then give the folder")
     if suffix in PANORAMAS:
         raise SourceError(f"{path}: a raw panorama; export a flat video of one direction in its maker's program")
     if path.name in tum.LISTS:
@@ -384,8 +375,6 @@ def _open_live(spec: str, camera: str | Path | None, telemetry: str | Path | Non
     """Open a live source, which needs sockets and (for a drone) the ``[drone]`` extra."""
     if telemetry is not None:
         raise SourceError(f"{spec}: a live source brings its own telemetry; omit --telemetry")
-    if importlib.util.find_spec("edgeslam_torch.readers.live") is None:
-        raise SourceError(f"{spec}: this installation has no live sources")
-    live = importlib.import_module("edgeslam_torch.readers.live")
-    source: Source = live.open_live(spec, camera=camera, max_frames=max_frames)
-    return source
+    from edgeslam_torch.readers.live import open_live
+
+    return open_live(spec, camera, max_frames)

@@ -1,6 +1,5 @@
 """Live view of a flight in rerun: pose, occupancy, path, exits and decisions."""
 
-import importlib
 import math
 import re
 from pathlib import Path
@@ -8,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from edgeslam_torch.extras import needs_extra
 from edgeslam_torch.flying.flight_controller import Moment
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.types import FloatArray
-from edgeslam_torch.viewer.rerun_viewer import check_writable
+from edgeslam_torch.viewer.rerun_viewer import open_recording
 
 _EVERY_S = 0.5
 """Interval between updates of the occupancy: some thousand cells each."""
@@ -32,17 +30,8 @@ class FlightView:
     """
 
     def __init__(self, name: str, save: Path | None = None) -> None:
-        with needs_extra("viewer", "the viewer"):
-            self._rr: Any = importlib.import_module("rerun")
-            layout = _layout(importlib.import_module("rerun.blueprint"))
-        # rerun warns of slashes and colons in a name.
-        self._stream: Any = self._rr.RecordingStream(re.sub(r"[^\w-]+", "_", f"edgeslam_flight_{name}"))
-        if save is not None:
-            check_writable(save)
-            self._stream.save(str(save), default_blueprint=layout)
-        else:
-            self._stream.spawn(default_blueprint=layout)
-        self._stream.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        plain = re.sub(r"[^\w-]+", "_", f"edgeslam_flight_{name}")  # rerun warns of slashes and colons
+        self._rr, self._stream = open_recording(plain, save, True, _layout)
         self._began_s = self._shown_s = math.nan
         self._flown: list[FloatArray] = []
         self._revision, self._words = 0, ""

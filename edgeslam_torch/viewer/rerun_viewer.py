@@ -4,6 +4,7 @@ rerun is imported only when a viewer is created.
 """
 
 import importlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,16 +44,7 @@ class Viewer:
     """
 
     def __init__(self, name: str, save: Path | None = None, show: bool = True, live: bool = True) -> None:
-        with needs_extra("viewer", "the viewer"):
-            self._rr: Any = importlib.import_module("rerun")
-            layout = _layout(importlib.import_module("rerun.blueprint"), live)
-        self._stream: Any = self._rr.RecordingStream(f"edgeslam {name}")
-        if save is not None:
-            check_writable(save)
-            self._stream.save(str(save), default_blueprint=layout)
-        elif show:
-            self._stream.spawn(default_blueprint=layout)
-        self._log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._rr, self._stream = open_recording(f"edgeslam {name}", save, show, lambda rrb: _layout(rrb, live))
         self._begin_s: float | None = None
         self._piece: list[FloatArray] = []
         self._piece_status = ""
@@ -166,14 +158,31 @@ def _layout(rrb: Any, live: bool) -> Any:
     return rrb.Blueprint(rrb.Horizontal(scene, pictures, plots, column_shares=[4, 3, 3]), collapse_panels=True)
 
 
-def check_writable(path: Path) -> None:
-    """rerun itself reports an unwritable file late, on a thread.
+def open_recording(name: str, save: Path | None, show: bool, layout: Callable[[Any], Any]) -> tuple[Any, Any]:
+    """rerun, and a recording with z up that is written to a file or shown in the viewer's window.
+
+    Args:
+        name: Title.
+        save: ``.rrd`` file to write.
+        show: Start the window, without a file.
+        layout: Makes the window's layout from ``rerun.blueprint``.
 
     Raises:
-        OutputError: If it cannot be written.
+        MissingPackageError: If rerun is not installed.
+        OutputError: If ``save`` cannot be written; rerun itself would report it late, on a thread.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        create(path).close()  # rerun itself would follow a link
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    with needs_extra("viewer", "the viewer"):
+        rr: Any = importlib.import_module("rerun")
+        made = layout(importlib.import_module("rerun.blueprint"))
+    stream: Any = rr.RecordingStream(name)
+    if save is not None:
+        try:
+            save.parent.mkdir(parents=True, exist_ok=True)
+            create(save).close()  # rerun itself would follow a link
+        except OSError as error:
+            raise OutputError(f"{save}: cannot be written ({error.strerror or error})") from error
+        stream.save(str(save), default_blueprint=made)
+    elif show:
+        stream.spawn(default_blueprint=made)
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    return rr, stream

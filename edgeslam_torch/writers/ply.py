@@ -29,22 +29,16 @@ NORMAL = ("nx", "ny", "nz")
 
 _PLY_TYPES = {
     "char": "i1",
-    "int8": "i1",
     "uchar": "u1",
-    "uint8": "u1",
     "short": "i2",
-    "int16": "i2",
     "ushort": "u2",
-    "uint16": "u2",
     "int": "i4",
-    "int32": "i4",
     "uint": "u4",
-    "uint32": "u4",
     "float": "f4",
-    "float32": "f4",
     "double": "f8",
-    "float64": "f8",
+    **{np.dtype(kind).name: kind for kind in ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")},
 }
+"""The format's own names, and those of newer programs: ``float32``."""
 _NAMES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _MAX_HEADER_BYTES = 65536
 

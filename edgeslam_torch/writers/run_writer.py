@@ -37,26 +37,30 @@ OUTPUTS = (
     *(CONFIG, CAMERA, OBSERVATIONS, PICTURE, "report.html"),
 )
 
-STATUS_COLUMNS = (
-    "index",
-    "stamp_s",
-    "status",
-    "reason",
-    "matches",
-    "inliers",
-    "parallax_deg",
-    "keyframe",
-    "piece",
-    "supported",
-    "scale",
-    "scale_sigma",
-    "scale_source",
-    "metric",
-    "revision",
-    "unit",
-    "step_ms",
-    "image",
-)
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else ""
+
+
+_COLUMNS: dict[str, Callable[[SlamOutput], str]] = {
+    "index": lambda output: str(output.index),
+    "stamp_s": lambda output: f"{output.stamp_s:.6f}",
+    "status": lambda output: str(output.status),
+    "reason": lambda output: output.reason,
+    "matches": lambda output: str(output.matches),
+    "inliers": lambda output: str(output.inliers),
+    "parallax_deg": lambda output: _number(math.degrees(output.parallax_rad), 4),
+    "keyframe": lambda output: str(int(output.keyframe)),
+    "piece": lambda output: str(output.piece),
+    "supported": lambda output: str(int(output.status.supported)),
+    "scale": lambda output: _number(output.scale.value, 6),
+    "scale_sigma": lambda output: _number(output.scale.sigma, 6),
+    "scale_source": lambda output: output.scale.source,
+    "metric": lambda output: str(int(output.metric)),
+    "revision": lambda output: str(output.revision),
+    "unit": lambda output: _number(output.unit, 6),
+}
+STATUS_COLUMNS = (*_COLUMNS, "step_ms", "image")
 """Columns of ``status.csv``, followed by one column ``<stage>_ms`` per stage."""
 
 TRAJECTORY_HEADER = "# stamp_s tx ty tz qx qy qz qw, camera to world\n"
@@ -221,7 +225,8 @@ class _LiveFiles:
             self._stages += new
             self._rewrite_status(self._status_rows())
         stages = [_number(output.stage_ms.get(stage, math.nan), 3) for stage in self._stages]
-        self._status.write(_csv_line([*_status_row(output, step_ms, image), *stages]))
+        known = [text(output) for text in _COLUMNS.values()]
+        self._status.write(_csv_line([*known, _number(step_ms, 3), image, *stages]))
 
     def settle(self, support: Support) -> None:
         """Replace each frame's live support by that of its final pose."""
@@ -273,33 +278,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (float, np.floating)):
         return float(value) if math.isfinite(value) else None
     return str(value)
-
-
-def _status_row(output: SlamOutput, step_ms: float, image: str) -> list[str]:
-    return [
-        str(output.index),
-        f"{output.stamp_s:.6f}",
-        str(output.status),
-        output.reason,
-        str(output.matches),
-        str(output.inliers),
-        _number(math.degrees(output.parallax_rad), 4),
-        str(int(output.keyframe)),
-        str(output.piece),
-        str(int(output.status.supported)),
-        _number(output.scale.value, 6),
-        _number(output.scale.sigma, 6),
-        output.scale.source,
-        str(int(output.metric)),
-        str(output.revision),
-        _number(output.unit, 6),
-        _number(step_ms, 3),
-        image,
-    ]
-
-
-def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else ""
 
 
 def _csv_line(cells: Sequence[str]) -> str:

@@ -36,6 +36,11 @@ def test_a_jpeg_is_read_in_grey_and_in_colour_when_asked(entry):
     off = frame.grey.astype(int) - cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
     assert np.abs(off).max() <= 3
     assert abs(off.mean()) < 0.5
+    grey = read_frame(entry("grey.jpg", picture()[:, :, 0]))
+    np.testing.assert_array_equal(grey.image, grey.grey)
+    other = read_frame(entry("a.png", picture()))
+    np.testing.assert_array_equal(other.image, picture())
+    assert other.grey is None
 
 
 def test_a_jpeg_that_is_none_or_of_another_size_is_left_out(entry, tmp_path):
@@ -129,14 +134,3 @@ def test_the_size_of_most_images_is_the_recordings(tmp_path, odd):
         cv2.imwrite(str(entries[i].path), picture()[: 32 + i])
     with pytest.raises(SourceError, match="here: images of several sizes"):
         usual_size(entries, "here")
-
-
-def test_a_grey_jpeg_stays_grey(entry):
-    frame = read_frame(entry("a.jpg", picture()[:, :, 0]))
-    np.testing.assert_array_equal(frame.image, frame.grey)
-
-
-def test_another_format_is_decoded_once(entry):
-    frame = read_frame(entry("a.png", picture()))
-    np.testing.assert_array_equal(frame.image, picture())
-    assert frame.grey is None

@@ -5,8 +5,8 @@ import os
 import sys
 from pathlib import Path
 
-from edgeslam_torch.commands.shared import add_set
 from edgeslam_torch.files.output_file import output_file
+from edgeslam_torch.help.options import add_set
 
 
 def add_runs_to(parser: argparse.ArgumentParser, seeds: int) -> None:

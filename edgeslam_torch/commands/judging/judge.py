@@ -5,10 +5,10 @@ import json
 from pathlib import Path
 
 from edgeslam_torch.commands.judging._common import recordings, say
-from edgeslam_torch.commands.shared import add_set
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.output_file import add_overwrite_to, check_new, check_not_read
+from edgeslam_torch.help.options import add_set
 
 CELLS = ("base", "variants", "flights", "telemetry", "imu", "all")
 

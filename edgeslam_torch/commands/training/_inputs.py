@@ -4,6 +4,7 @@ import argparse
 import logging
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,9 +13,9 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from edgeslam_torch.commands import shared
 from edgeslam_torch.errors import ConfigError, SourceError
 from edgeslam_torch.files.plain import subfolder
+from edgeslam_torch.help.options import EXIT_INTERRUPTED
 
 if TYPE_CHECKING:
     from edgeslam_torch.models.record import Metadata
@@ -208,8 +209,8 @@ def in_folder(args: argparse.Namespace, work: "Callable[[OutFolder], TrainingRes
                 outcome = work(out)
             except KeyboardInterrupt:
                 if rank == 0:
-                    shared.say(f"interrupted; {_left(out)}")
-                return shared.EXIT_INTERRUPTED
+                    sys.stderr.write(f"edgeslam: interrupted; {_left(out)}\n")
+                return EXIT_INTERRUPTED
     if rank == 0:
         print(outcome.describe())
     return 0

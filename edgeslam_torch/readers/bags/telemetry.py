@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.drone.sdk_state import FIELDS, parse_state, sample_from_sdk
-from edgeslam_torch.geometry.rotations import matrix_from_rpy, rpy_from_matrix
+from edgeslam_torch.geometry.rotations import matrix_from_rpy
 from edgeslam_torch.readers.bags.bag import Bag, Raw
 from edgeslam_torch.readers.bags.clock import TopicClock, header_s
 from edgeslam_torch.readers.bags.odometry import Motion, motion_of_odometry
@@ -160,27 +160,15 @@ def _never_turns(quaternions: FloatArray) -> bool:
 
 def _attitude(tables: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray] | None:
     """Stamps ``(N,)`` and roll, pitch, yaw ``(N, 3)`` of the Imu, else of the odometry."""
+    from scipy.spatial.transform import Rotation
+
     for role, first in (("imu", 1), ("odom", 4)):
         if role in tables:
-            rpy = np.array([rpy_of_quaternion(row) for row in tables[role][:, first : first + 4]])
-            good = np.isfinite(rpy).all(axis=1)
-            if good.any():
-                return tables[role][good, 0], rpy[good]
+            quaternions = tables[role][:, first : first + 4]
+            unit = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) < 0.01
+            if unit.any():
+                return tables[role][unit, 0], Rotation.from_quat(quaternions[unit]).as_euler("ZYX")[:, ::-1]
     return None
-
-
-def rpy_of_quaternion(q: FloatArray) -> FloatArray:
-    """``(3,)`` roll, pitch, yaw [rad] of ``x y z w``; NaN unless it is of unit length to 1 %."""
-    length = float(np.linalg.norm(q))
-    if not abs(length - 1.0) < 0.01:
-        return np.full(3, np.nan)
-    x, y, z, w = (float(c) / length for c in q)
-    R = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return rpy_from_matrix(np.array(R))
 
 
 def _motion_of_twist(

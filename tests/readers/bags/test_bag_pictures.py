@@ -73,10 +73,11 @@ def test_yuv_orders():
 
 @pytest.mark.parametrize(
     ("encoding", "count", "width", "height"),
-    [("32FC1", 4, 1, 1), ("nv12", 6, 2, 2), ("rgb8", 5, 1, 2), ("rgb8", 0, 0, 0), ("mono8", 1, 10**6, 10**6)],
+    [("32FC1", 4, 1, 1), ("nv12", 6, 2, 2), ("rgb8", 5, 1, 2), ("rgb8", 0, 0, 0)]
+    + [("yuyv", 18, 3, 3), ("uyvy", 2, 1, 1), ("yuv422", 10, 5, 1), ("mono8", 1, 10**6, 10**6)],
 )
 def test_what_is_no_picture_is_refused(encoding, count, width, height):
-    with pytest.raises(SourceError):
+    with pytest.raises(SourceError, match=f"{encoding}|million"):
         _read(encoding, [0] * count, width, height)
 
 
@@ -102,12 +103,6 @@ def test_the_first_picture_sets_the_range_of_all():
     bright, dark = (np.full((2, 2), value, "<u2").tobytes() for value in (65535, 255))
     assert decoder.decode(_message("mono16", bright, 2, 2)).max() == 255
     assert decoder.decode(_message("mono16", dark, 2, 2)).max() == 0
-
-
-@pytest.mark.parametrize(("encoding", "width", "height"), [("yuyv", 3, 3), ("uyvy", 1, 1), ("yuv422", 5, 1)])
-def test_sizes_that_an_encoding_cannot_have_are_refused_in_one_line(encoding, width, height):
-    with pytest.raises(SourceError, match=encoding):
-        _read(encoding, [128] * (2 * width * height), width, height)
 
 
 def test_a_row_of_four_gigabytes_in_one_line_costs_no_memory():

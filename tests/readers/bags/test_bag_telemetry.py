@@ -114,13 +114,9 @@ def test_the_tello_drivers_own_message_is_read_by_the_bags_definition(tmp_path):
         assert sample.acceleration_m_s2[2] == pytest.approx(9.80665)
 
 
-def test_odometry_whose_child_is_its_world_is_not_turned(tmp_path):
+def test_odometry_whose_child_is_its_world_is_not_turned_nor_on_a_short_way(tmp_path):
     _check(_read(tmp_path, _odometry(_world, "odom")).telemetry)
-
-
-def test_on_a_short_way_the_child_frame_decides(tmp_path):
-    short = _odometry(_world, "odom")[:4]
-    samples = _read(tmp_path, short).telemetry
+    samples = _read(tmp_path, _odometry(_world, "odom")[:4]).telemetry
     assert samples[3].velocity_m_s == pytest.approx(_world(samples[3].stamp_s))
 
 

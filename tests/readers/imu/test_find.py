@@ -134,17 +134,14 @@ def test_written_files_give_the_same_readings_and_model(tmp_path, rng):
     assert (model.T_imu_cam == T_IMU_CAM).all() and model.time_offset_s == 0.01
 
 
-def test_what_is_not_stated_is_said_and_left_to_estimation(tmp_path):
+def test_without_an_imu_there_is_no_warning_and_what_is_not_stated_of_one_is_left_to_estimation(tmp_path):
+    assert found(tmp_path) == (None, None, [])
+    with pytest.raises(EdgeSlamError, match="readings"):
+        found(tmp_path, Given(model=tmp_path / "imu.yaml"))
     (tmp_path / "imu.csv").write_text(HEADER + ROWS)
     model, _, said = found(tmp_path)
     assert model.T_imu_cam is None and model.time_offset_s is None and model.source == ImuModel().source
     assert len(said) == 2 and "noise" in said[0] and "mount and clock" in said[1]
-
-
-def test_without_an_imu_there_is_no_warning(tmp_path):
-    assert found(tmp_path) == (None, None, [])
-    with pytest.raises(EdgeSlamError, match="readings"):
-        found(tmp_path, Given(model=tmp_path / "imu.yaml"))
 
 
 def test_given_files_come_before_those_of_the_folder(tmp_path):

@@ -46,16 +46,6 @@ def test_bad_files_are_named(sequence):
         open_source(sequence)
 
 
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_calibration_is_read_in_any_encoding_of_tables(sequence, encoding):
-    (sequence / "calib.txt").write_text(CALIB, encoding=encoding)
-    (sequence / "image_2").rename(sequence / "image_0")
-    assert open_source(sequence).camera.fx == 700.0
-    (sequence / "calib.txt").write_text(f"{CALIB}K\xfcche\n", encoding="latin-1")
-    with pytest.raises(CalibrationError, match=r"calib\.txt: not a text file"):
-        open_source(sequence)
-
-
 def test_image_without_a_stamp_is_left_out_by_name(sequence, write_images):
     write_images(sequence / "image_2", ["000004.png", "cover.png"])
     assert [p.reason for p in open_source(sequence).problems] == ["its name is not a line of times.txt"] * 2
