@@ -51,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Record until stopped, and print a summary."""
     from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.readers.live import open_live, open_tello
     from edgeslam_torch.terminal.progress import Progress
 
     is_drone = args.source.startswith("tello://")
@@ -60,7 +61,10 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError("--max-frames and --duration must be positive")
     with Progress("waits for the drone" if is_drone else "waits for the camera") as progress, Signals() as signals:
         try:
-            source, messages, tello = _open(args, is_drone)
+            if is_drone:
+                source, tello, messages = open_tello(args.source, args.camera, args.max_frames, args.fly)
+            else:
+                source, tello, messages = open_live(args.source, args.camera, args.max_frames), None, []
         except KeyboardInterrupt:
             say("interrupted; nothing was recorded")
             return signals.exit_code
@@ -69,15 +73,6 @@ def main(args: argparse.Namespace) -> int:
         finally:
             source.close()
     return signals.exit_code
-
-
-def _open(args: argparse.Namespace, is_drone: bool) -> "tuple[LiveSource, list[StateMessage], Tello | None]":
-    from edgeslam_torch.readers.live import open_live, open_tello
-
-    if not is_drone:
-        return open_live(args.source, args.camera, args.max_frames), [], None
-    source, tello, messages = open_tello(args.source, args.camera, args.max_frames, args.fly)
-    return source, messages, tello
 
 
 def _record(

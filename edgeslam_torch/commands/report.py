@@ -36,19 +36,15 @@ def main(args: argparse.Namespace) -> int:
 
     if args.out is not None and len(args.runs) != 2:
         raise ConfigError(f"--out is for the comparison of two runs, got {len(args.runs)}")
-    with Progress("making the report"):
-        return _write(args)
-
-
-def _write(args: argparse.Namespace) -> int:
     from edgeslam_torch.eval.report.page import write_report
 
-    for run in args.runs:
-        if len(args.runs) == 2 and run.is_file():
-            continue  # a trajectory alone has no report, but can be compared
-        _say(write_report(run, args.groundtruth, judge_map=not args.no_map_score))
-    if len(args.runs) == 2:
-        _say(_compared(args))
+    with Progress("making the report"):
+        for run in args.runs:
+            if len(args.runs) == 2 and run.is_file():
+                continue  # a trajectory alone has no report, but can be compared
+            _say(write_report(run, args.groundtruth, judge_map=not args.no_map_score))
+        if len(args.runs) == 2:
+            _say(_compared(args))
     return 0
 
 

@@ -24,20 +24,16 @@ def main(args: argparse.Namespace) -> int:
     if args.viewer or args.save_rrd is not None:
         return _rerun(args)
     page = args.run / "report.html"
-    page = page if page.is_file() else _written(args.run)
+    if not page.is_file():
+        from edgeslam_torch.eval.report.page import write_report
+        from edgeslam_torch.terminal.progress import Progress
+
+        with Progress("making the report"):
+            page = write_report(args.run)
     print(page.resolve())
     if not args.only_print and not webbrowser.open(page.resolve().as_uri()):
         print("no browser here: copy the page to a machine with one; it is self-contained")
     return 0
-
-
-def _written(run: Path) -> Path:
-    from edgeslam_torch.terminal.progress import Progress
-
-    with Progress("making the report"):
-        from edgeslam_torch.eval.report.page import write_report
-
-        return write_report(run)
 
 
 def _rerun(args: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from edgeslam_torch.models.record import weights_file
 if TYPE_CHECKING:
     from onnx import ModelProto
 
-    from edgeslam_torch.models.download import Fetched, Remote
+    from edgeslam_torch.models.download import Fetched
     from edgeslam_torch.models.onnx.external import ExternalNetwork
     from edgeslam_torch.models.record import Metadata
 
@@ -66,8 +66,10 @@ def _list(_: argparse.Namespace) -> None:
 def _download(args: argparse.Namespace) -> None:
     from edgeslam_torch.files.download import remember, remembered
     from edgeslam_torch.files.user_cache import cache_folder
-    from edgeslam_torch.models.download import REMOTES
+    from edgeslam_torch.models.convert import convert_upstream
+    from edgeslam_torch.models.download import REMOTES, download
     from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
+    from edgeslam_torch.terminal.progress import Progress
 
     if args.name in PRESETS:
         remote, suffix, raw = PRESETS[args.name].remote, ".onnx", preset_file(args.name)
@@ -79,27 +81,17 @@ def _download(args: argparse.Namespace) -> None:
     if args.out is not None and args.name in PRESETS:  # the description is written beside the network
         check_new(args.out.with_suffix(".toml"), args.overwrite)
     before = remembered(raw)
-    fetched = _fetch(remote, raw, args.sha256)
+    with Progress(remote.name, unit="MB") as progress:
+        fetched = download(remote.urls, raw, args.sha256, progress.downloaded)
     target = args.out or cache_folder() / f"{remote.name}{suffix}"
     target.parent.mkdir(parents=True, exist_ok=True)
-    (_describe if args.name in PRESETS else _converted)(args.name, raw, target)
+    if args.name in PRESETS:
+        _describe(args.name, raw, target)
+    else:
+        convert_upstream(raw, target, official=True)
     kept = remember(raw, fetched.sha256)  # remember the checksum of valid files only
     print(f"{fetched.url}\nsha256 {fetched.sha256}, {_trust(args.sha256, before, fetched, kept)}")
     print(target)
-
-
-def _fetch(remote: "Remote", target: Path, sha256: str | None) -> "Fetched":
-    from edgeslam_torch.models.download import download
-    from edgeslam_torch.terminal.progress import Progress
-
-    with Progress(remote.name, unit="MB") as progress:
-        return download(remote.urls, target, sha256, progress.downloaded)
-
-
-def _converted(_: str, raw: Path, target: Path) -> None:
-    from edgeslam_torch.models.convert import convert_upstream
-
-    convert_upstream(raw, target, official=True)
 
 
 def _describe(name: str, raw: Path, target: Path) -> None:
