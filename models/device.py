@@ -13,11 +13,7 @@ DEVICES = ("auto", "cpu", "cuda", "mps")
 
 
 def check_device(name: str) -> None:
-    """Refuse a name that is none.
-
-    Raises:
-        ConfigError: With those that there are.
-    """
+    """Refuse a name that is none."""
     if name not in DEVICES:
         raise ConfigError(f"--device {name}: there are {', '.join(DEVICES)}")
 

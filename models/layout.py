@@ -79,11 +79,7 @@ class Widths:
 
     @staticmethod
     def of_state_dict(state: Mapping[str, HasShape]) -> "Widths":
-        """Read the widths off a checkpoint's shapes, whichever variant it is.
-
-        Raises:
-            WeightsError: If a layer is missing or no convolution of at most 4096 channels.
-        """
+        """Read the widths off a checkpoint's shapes, whichever variant it is."""
 
         def width(name: str) -> int:
             if name not in state:
@@ -106,11 +102,7 @@ PRUNED = Widths((16, 56, 88, 120, 144, 256, 408, 376, 272, 288, 296, 328, 480, 5
 
 
 def variant_of(state: Mapping[str, HasShape]) -> Variant:
-    """The variant of a checkpoint without a record, by its names and widths.
-
-    Raises:
-        WeightsError: If it is not a FastDepth checkpoint.
-    """
+    """The variant of a checkpoint without a record, by its names and widths."""
     widths = Widths.of_state_dict(state)
     if "conv0.0.weight" in state:
         return Variant.SKIPADD if widths.encoder[-1] == FULL.encoder[-1] else Variant.PRUNED

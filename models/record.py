@@ -124,11 +124,7 @@ def metadata_from_json(text: str) -> Metadata:
 
 
 def metadata_from_record(record: object) -> Metadata:
-    """The same from the parsed record.
-
-    Raises:
-        WeightsError: What is wrong with it; the caller adds the file's name.
-    """
+    """The same from the parsed record."""
     try:
         if not isinstance(record, dict):
             raise ValueError(f"it is {reprlib.repr(record)}, not a table")

@@ -73,11 +73,7 @@ class TorchTensor:
     storage: Callable[[], bytes]
 
     def read(self) -> bytes:
-        """Its numbers in row-major order, little endian.
-
-        Raises:
-            WeightsError: If bytes are missing.
-        """
+        """Its numbers in row-major order, little endian."""
         items = np.frombuffer(self.storage(), f"<u{self.item_bytes}")[self.offset :]
         steps = tuple(s * self.item_bytes for s in self.stride)
         return np.lib.stride_tricks.as_strided(items, self.shape, steps, writeable=False).tobytes()

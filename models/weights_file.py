@@ -165,11 +165,7 @@ def _counter(name: str, stored: Stored) -> Array:
 
 
 def _as_float32(name: str, stored: Stored) -> Array:
-    """A parameter in single precision.
-
-    Raises:
-        WeightsError: If a value is not finite, absurdly large, or a negative variance.
-    """
+    """A parameter in single precision."""
     dtype = FLOATS.get(stored.kind)
     if dtype is None:
         raise WeightsError(f"{name} holds {stored.kind} numbers, not one of {', '.join(FLOATS)}")

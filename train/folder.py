@@ -122,11 +122,7 @@ def inputs(
 ) -> dict[str, Any]:
     """What determines the result, by name, before anything is read; with `contents`, all of it.
 
-    Args:
-        start: Network and metadata to begin with.
-        data: Name and kind of each set: ``depth`` (labelled) or ``run`` (poses and map points).
-        validation: Names of the sets to validate on.
-        settings: By name, plain values.
+    ``data`` has name and kind of each set: ``depth`` (labelled) or ``run`` (poses and map points).
     """
     named = ", ".join(f"{name} ({kind})" for name, kind in data)
     return {"weights": weights_name(*start), "data": named, "validation": ", ".join(validation) or "none", **settings}
@@ -176,12 +172,7 @@ def _short(value: Any) -> str:
 
 
 class OutFolder:
-    """Folder of a fine-tuning; only the first process of a group writes.
-
-    Args:
-        path: The folder, which exists.
-        existing: What to do with an older fine-tuning.
-    """
+    """Folder of a fine-tuning; only the first process of a group writes."""
 
     def __init__(self, path: Path, existing: Existing = Existing.SAME) -> None:
         self.path, self.existing = path, existing
@@ -226,12 +217,7 @@ class OutFolder:
             )
 
     def begin(self, given: dict[str, Any]) -> None:
-        """Record the inputs, and remove files of other trainings.
-
-        Raises:
-            ConfigError, OutputError: As for `check`.
-            OSError: If the file cannot be written.
-        """
+        """Record the inputs, and remove files of other trainings."""
         self.check(given)
         record = self._record() if self.existing is not Existing.OVERWRITE else None
         # One that was interrupted before the first step may have left its teacher's depth.
@@ -254,11 +240,7 @@ class OutFolder:
         return None if _differences(record["given"], given) else _outcome(record["outcome"], weights)
 
     def finish(self, outcome: TrainingResult) -> None:
-        """Record the outcome.
-
-        Raises:
-            OSError: If the file cannot be written.
-        """
+        """Record the outcome."""
         kept = {k: v for k, v in dataclasses.asdict(outcome).items() if k not in ("weights", "nothing_to_do")}
         self._write({**(self._record() or {}), "outcome": kept})
 

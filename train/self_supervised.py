@@ -138,7 +138,8 @@ class SelfSupervised:
         motions = np.stack([relative_motion(view, v) for v in others])
         motions[:, :3, 3] *= scale
         flip = bool(rng.random() < FLIP)
-        uv = view.uv @ _affine(K, view.K)[:2, :2].T + _affine(K, view.K)[:2, 2]
+        to_crop = K @ np.linalg.inv(view.K)
+        uv = view.uv @ to_crop[:2, :2].T + to_crop[:2, 2]
         if flip:
             images = [np.ascontiguousarray(x[:, ::-1]) for x in images]
             mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
@@ -182,10 +183,6 @@ def _zoomed(view: PosedView, size: tuple[int, int], zoom: tuple[float, float], r
 
 def _seen(view: PosedView, K: FloatArray, size: tuple[int, int]) -> NDArray[np.uint8]:
     return warp(View.without_depth(view.image, view.K), K, np.eye(3), size).image
-
-
-def _affine(K: FloatArray, K_before: FloatArray) -> FloatArray:
-    return K @ np.linalg.inv(K_before)
 
 
 def _inside(

@@ -114,11 +114,7 @@ class TrainState:
 
 
 def save_state(state: TrainState, path: Path) -> None:
-    """Write all of a run's state, atomically: a kill during writing leaves the previous file.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Write all of a run's state, atomically: a kill during writing leaves the previous file."""
     parts = ("network", "averaged", "optimiser", "scaler")
     content = {name: getattr(state, name).state_dict() for name in parts}
     content |= {name: getattr(state, name) for name in COUNTED}

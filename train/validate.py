@@ -133,17 +133,13 @@ def contradiction(network: DepthModule, metadata: Metadata, folder: DepthFolder)
     return ""
 
 
-def can_be_scored(view: View) -> bool:
-    """Whether it has depth that counts."""
-    return bool(_counted(view).any())
-
-
-def _counted(view: View) -> NDArray[np.bool_]:
+def counted_pixels(view: View) -> NDArray[np.bool_]:
+    """Where it has depth that counts ``(H, W)``."""
     return (view.depth_m > MIN_DEPTH_M) & (view.depth_m < MAX_DEPTH_M)
 
 
 def _scores_of(predicted: FloatArray, view: View) -> tuple[float, ...] | None:
-    counted = _counted(view)
+    counted = counted_pixels(view)
     if not counted.any():
         return None
     found = report_depth(predicted, np.where(counted, view.depth_m, 0.0), view.image)
@@ -165,7 +161,7 @@ def residuals_and_sigma(
     residuals, sigmas = [], []
     for view in views:
         depth, sigma = predict_metres(network, metadata, view)
-        v, u = np.nonzero(_counted(view))
+        v, u = np.nonzero(counted_pixels(view))
         if not len(v):
             continue
         pick = rng.integers(len(v), size=min(PIXELS_PER_VIEW, len(v)))

@@ -88,11 +88,7 @@ def _open_dimensions(options: ExportOptions) -> "tuple[dict[int, Any]] | None":
 
 
 def set_opset(model: onnx.ModelProto, opset: int) -> onnx.ModelProto:
-    """The exporter writes opset 18 or later; older ones come from ONNX's own version converter.
-
-    Raises:
-        OutputError: If the conversion fails.
-    """
+    """The exporter writes opset 18 or later; older ones come from ONNX's own version converter."""
     if opset != model.opset_import[0].version:
         try:
             model = onnx.version_converter.convert_version(model, opset)
@@ -111,11 +107,7 @@ def write_metadata(model: onnx.ModelProto, metadata: Metadata, options: ExportOp
 
 
 def check_model(model: onnx.ModelProto, opset: int) -> None:
-    """Run ONNX's checker and verify the opset.
-
-    Raises:
-        OutputError: If either fails.
-    """
+    """Run ONNX's checker and verify the opset."""
     written = {o.domain: o.version for o in model.opset_import}.get("", 0)
     if written != opset:
         raise OutputError(f"requested opset {opset}, but the exporter wrote {written}")

@@ -156,11 +156,7 @@ def _start(known: dict[str, Any], record: dict[str, Any], origin: str) -> Extern
 
 
 def _with_fixed_size(network: ExternalNetwork, model: onnx.ModelProto, path: Path) -> ExternalNetwork:
-    """The description with names and size of the graph's ends, checked against each other.
-
-    Raises:
-        WeightsError: If the graph's inputs or outputs differ from the description.
-    """
+    """The description with names and size of the graph's ends, checked against each other."""
     constants = {tensor.name for tensor in model.graph.initializer}
     inputs = [value for value in model.graph.input if value.name not in constants]
     outputs = [value.name for value in model.graph.output]

@@ -26,11 +26,7 @@ class Arithmetic:
 
 
 def arithmetic(device: str, amp: bool | None) -> Arithmetic:
-    """Device and type of a training.
-
-    Args:
-        device: As for `edgeslam_torch.models.device.find_device`.
-        amp: Whether to compute in half precision; None: on CUDA alone.
+    """Device, as `find_device` names it, and type of a training; half precision if asked for, or on CUDA.
 
     Raises:
         ConfigError: If there is no such device.

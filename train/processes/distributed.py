@@ -1,6 +1,7 @@
 """Several processes under ``torchrun``; a single process needs none of it.
 
-They share their files: every process must see the same data and output folder.
+They share their files: every process must see the same data and output folder. Where they wait for each other, a
+process that is gone is a `ProcessError`.
 """
 
 import importlib
@@ -93,11 +94,7 @@ def share_of(items: Sequence[T]) -> Sequence[T]:
 
 
 def everyones(messages: Sequence[str]) -> list[str]:
-    """The messages of all processes, once each has come here.
-
-    Raises:
-        ProcessError: If one is gone.
-    """
+    """The messages of all processes, once each has come here."""
     if not _together():
         return list(messages)
     gathered: list[list[str]] = [[] for _ in range(world())]
@@ -107,11 +104,7 @@ def everyones(messages: Sequence[str]) -> list[str]:
 
 
 def add_up(tensors: Sequence[Tensor]) -> None:
-    """Replace each tensor by its sum over the processes, all as one message.
-
-    Raises:
-        ProcessError: If one is gone.
-    """
+    """Replace each tensor by its sum over the processes, all as one message."""
     if not _together():
         return
     flat = torch.cat([t.flatten() for t in tensors])

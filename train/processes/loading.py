@@ -29,8 +29,6 @@ def drawn(draw: Callable[[int], T], first: int, last: int, workers: int) -> Iter
 
     Args:
         draw: Makes one step's batch. What it raises, the iterator raises.
-        first: First step.
-        last: Step after the last one.
         workers: Processes, one thread each; 0 draws in this one.
 
     Raises:

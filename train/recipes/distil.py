@@ -108,11 +108,7 @@ def _copied(new: nn.Module, old: nn.Module) -> bool:
 def label(teacher: DepthNetwork, sequence: PosedSequence, log_scale: float, kept: Path) -> DepthFolder:
     """Dense depth [m] of a run's views by a teacher: measured where the plane sweep is confirmed, else the teacher's.
 
-    Args:
-        teacher: The larger network.
-        sequence: The run.
-        log_scale: Log of metres per map unit.
-        kept: From `kept_depth`.
+    ``log_scale`` is the log of metres per map unit; ``kept`` the folder from `kept_depth`.
 
     Raises:
         SourceError: If the teacher agrees with no view of the map.

@@ -38,8 +38,8 @@ from edgeslam_torch.train.processes.distributed import by_first, rank
 from edgeslam_torch.train.self_supervised import SelfSupervised
 from edgeslam_torch.train.signals import Signal, Source, Supervised, Views
 from edgeslam_torch.train.state import TrainConfig, TrainState
-from edgeslam_torch.train.teachers.teach import Taught, kept_depth, log_metres, teach
-from edgeslam_torch.train.validate import DepthScores, calibrate_sigma, can_be_scored, metres_by, score
+from edgeslam_torch.train.teachers.teach import kept_depth, log_metres, teach
+from edgeslam_torch.train.validate import DepthScores, calibrate_sigma, counted_pixels, metres_by, score
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.posed import PosedSequence
@@ -189,7 +189,9 @@ def _prepared(
                 made_from = content(sequence), weights_name(start, metadata), scale
                 taught = teach(own, sequence, scale, kept_depth(kept_in, sequence.name, *made_from))
                 if not (data.validation or labelled):
-                    held_out += [_measured_only(t) for t in taught[::HELD_OUT]]
+                    for t in taught[::HELD_OUT]:
+                        measured = np.where(t.measured, t.view.depth_m, 0.0)
+                        held_out.append(dataclasses.replace(t.view, depth_m=measured))
                     taught = [t for i, t in enumerate(taught) if i % HELD_OUT]
                 sources.append(Source(sequence.name, [t.view for t in taught], 1.0))
             signals.append(Supervised(sources, metadata, name="teacher"))
@@ -197,7 +199,7 @@ def _prepared(
             signals.append(SelfSupervised(data.posed, metadata, scales))
     if data.validation:
         return signals, [v for f in data.validation for v in f.views]
-    return signals, [v for v in held_out if can_be_scored(v)]  # none, for a flight high above the ground
+    return signals, [v for v in held_out if counted_pixels(v).any()]  # none, for a flight high above the ground
 
 
 def _split(folders: Sequence[DepthFolder], keep_all: bool) -> tuple[list[Source], list[View]]:
@@ -213,10 +215,6 @@ def _split(folders: Sequence[DepthFolder], keep_all: bool) -> tuple[list[Source]
             views = Subset(views, [i for i in range(len(views)) if i % every])  # type: ignore[arg-type]
         sources.append(Source(folder.name, views, 1.0))
     return sources, held_out
-
-
-def _measured_only(taught: Taught) -> View:
-    return dataclasses.replace(taught.view, depth_m=np.where(taught.measured, taught.view.depth_m, 0.0))
 
 
 def _tuned_metadata(metadata: Metadata, data: Data) -> Metadata:

@@ -140,11 +140,7 @@ def _trained(
 
 
 def mean_of(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor], share: float) -> dict[str, torch.Tensor]:
-    """State of ``(1 - share) first + share second``; whole numbers are the first's.
-
-    Raises:
-        WeightsError: If they are not of the same network.
-    """
+    """State of ``(1 - share) first + share second``; whole numbers are the first's."""
     if {k: v.shape for k, v in first.items()} != {k: v.shape for k, v in second.items()}:
         raise WeightsError("only weights of one network have a mean: these differ in names or shapes")
     return {k: v.lerp(second[k], share) if v.is_floating_point() else v for k, v in first.items()}

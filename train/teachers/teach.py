@@ -58,13 +58,8 @@ class Taught:
 
 
 def kept_depth(root: Path, name: str, *content: object) -> Path:
-    """Folder in ``root`` for the depth of a run, named by a hash of all that it depends on.
-
-    Args:
-        root: Of one training, or of several that share their depth.
-        name: Of the run, for people.
-        content: Hash of images, poses and map points; the network; the scale.
-    """
+    """Folder in ``root`` for the depth of a run, named by a hash of all that it depends on: what the run holds, the
+    network, the scale."""
     return root / f"{name}-{hashlib.sha256(repr((content, __version__)).encode()).hexdigest()[:24]}"
 
 
@@ -96,19 +91,10 @@ def _nearest_pixels(uv: FloatArray, shape: tuple[int, ...]) -> tuple[NDArray[np.
 
 
 def teach(predict: Predict, sequence: PosedSequence, log_scale: float, folder: Path) -> list[Taught]:
-    """Views of a run with dense depth [m]; the processes of a group share the work by way of ``folder``.
+    """Views of a run with dense depth [m], ``predict``'s where it was not measured; ``log_scale`` is the log of metres
+    per map unit.
 
-    Existing files are reused, so an interrupted teacher resumes.
-
-    Args:
-        predict: Fills unmeasured pixels.
-        sequence: The run.
-        log_scale: Log of metres per map unit.
-        folder: From `kept_depth`; made when missing.
-
-    Raises:
-        OSError: If the file cannot be written.
-        ProcessError: If another process of the group is gone.
+    The processes of a group share the work by way of ``folder``, whose files let an interrupted teacher resume.
     """
     subfolder(folder.parent, folder.name)
     count = min(MOST, len(sequence.views))

@@ -78,10 +78,15 @@ def load_depth_folder(folder: Path, width: int = 400, stride: int = 1, max_frame
         raise SourceError(f"{folder}: no image with depth could be read{why}")
     for remark in (_words(problem) for problem in maps.problems if not problem.frames):
         logger.warning("%s", remark)
-    if left_out:
-        shown = ", ".join(left_out[:MAX_SHOWN]) + (", ..." if len(left_out) > MAX_SHOWN else "")
-        logger.warning("%s: %d images or depth maps left out: %s", folder, len(left_out), shown)
+    warn_of(left_out, f"{folder}: {len(left_out)} images or depth maps left out")
     return DepthFolder(folder.name, views, tuple(left_out))
+
+
+def warn_of(left_out: Sequence[str], what: str) -> None:
+    """Log what was left out, if anything, with the first reasons."""
+    if left_out:
+        more = ", ..." if len(left_out) > MAX_SHOWN else ""
+        logger.warning("%s: %s%s", what, ", ".join(left_out[:MAX_SHOWN]), more)
 
 
 def has_depth(folder: Path) -> bool:

@@ -11,7 +11,6 @@ import argparse
 import hashlib
 import io
 import json
-import logging
 import tarfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -28,9 +27,7 @@ from edgeslam_torch.files.plain import open_plain
 from edgeslam_torch.models.record import FOCAL_RANGE
 from edgeslam_torch.readers.images import decode
 from edgeslam_torch.train.views.augment import View
-from edgeslam_torch.train.views.datasets import MAX_SHOWN, DepthFolder, load_depth_folder, reduced
-
-logger = logging.getLogger(__name__)
+from edgeslam_torch.train.views.datasets import DepthFolder, load_depth_folder, reduced, warn_of
 
 IMAGES, DEPTHS = ("jpg", "jpeg", "png"), ("depth.png", "depth.npy")
 PARTS = {"image": IMAGES, "depth": DEPTHS, "calibration (json)": ("json",)}
@@ -73,12 +70,7 @@ class _Sample:
 
 
 class ShardedViews(Sequence[View]):
-    """Views of tar files, read and decoded on access; nothing is cached.
-
-    Args:
-        samples: Where they lie.
-        width: Images are reduced to this width [px] (never enlarged).
-    """
+    """Views of tar files, read, decoded and reduced to a width [px] on access; nothing is cached."""
 
     def __init__(self, samples: Sequence[_Sample], width: int) -> None:
         self._samples, self._width = samples, width
@@ -106,12 +98,7 @@ def is_sharded(path: Path) -> bool:
 
 
 def load_shards(path: Path, width: int = 400, max_frames: int | None = None) -> DepthFolder:
-    """The samples of a tar file or a folder of them, unread.
-
-    Args:
-        path: The file or folder.
-        width: Images are reduced to this width [px].
-        max_frames: Use only the first samples.
+    """The first ``max_frames`` samples of a tar file or a folder of them, unread; ``width`` is as of `ShardedViews`.
 
     Raises:
         SourceError: If a file is damaged or compressed, or there is no whole sample.
@@ -131,9 +118,7 @@ def load_shards(path: Path, width: int = 400, max_frames: int | None = None) -> 
         digest.update(repr((sample.shard.name, sample.name, ends)).encode())
     if not samples:
         raise SourceError(f"{path}: no sample of image, depth and calibration{f' ({left_out[0]})' if left_out else ''}")
-    if left_out:
-        shown = ", ".join(left_out[:MAX_SHOWN]) + (", ..." if len(left_out) > MAX_SHOWN else "")
-        logger.warning("%s: %d samples left out: %s", path, len(left_out), shown)
+    warn_of(left_out, f"{path}: {len(left_out)} samples left out")
     samples = samples[:max_frames]
     return DepthFolder(path.stem, ShardedViews(samples, width), tuple(left_out), digest.hexdigest())
 
