@@ -124,16 +124,7 @@ class CycleLoss(ResidualLoss):
     def forward(self, T_j_i: Tensor, uv: Tensor, depth_i: Tensor, depth_j: Tensor, K: Tensor) -> Tensor:
         """Mean (or sum) over edge pixels of the squared residuals ``()``, ``(B,)`` for a batch of pairs.
 
-        Args:
-            T_j_i: Motion from frame i to frame j ``(4, 4)`` or ``(B, 4, 4)``, in the depths' unit.
-            uv: Edge pixels in frame i ``(N, 2)`` or ``(B, N, 2)`` [px]; NaN for none.
-            depth_i: Their z-depths ``(N,)`` or ``(B, N)``; 0 where unknown.
-            depth_j: Depth map of frame j ``(H, W)`` or ``(B, H, W)``, or the depths sampled there, shaped as
-                ``depth_i``; 0, NaN or infinite where unknown.
-            K: Calibration matrix ``(3, 3)`` or ``(B, 3, 3)`` [px].
-
-        Raises:
-            ValueError: If shapes do not fit.
+        Arguments and errors are those of `residuals`.
         """
         return self.reduced(self.residuals(T_j_i, uv, depth_i, depth_j, K), 1)
 

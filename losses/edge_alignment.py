@@ -56,16 +56,7 @@ class EdgeAlignmentLoss(ResidualLoss):
     def forward(self, T_j_i: Tensor, uv: Tensor, depth_i: Tensor, uv_j: Tensor, normal_j: Tensor, K: Tensor) -> Tensor:
         """Mean (or sum) over edge pixels of squared distances ``()``, ``(B,)`` for a batch of pairs.
 
-        Args:
-            T_j_i: Motion from frame i to frame j ``(4, 4)`` or ``(B, 4, 4)``, in the depths' unit.
-            uv: Edge pixels in frame i ``(N, 2)`` or ``(B, N, 2)`` [px]; NaN for none.
-            depth_i: Their z-depths ``(N,)`` or ``(B, N)``; 0 where unknown.
-            uv_j: The partners in frame j, shaped as ``uv`` [px]; NaN for an edge without a partner.
-            normal_j: The partners' unit normals, shaped as ``uv``; zero for an edge without a partner.
-            K: Calibration matrix ``(3, 3)`` or ``(B, 3, 3)`` [px].
-
-        Raises:
-            ValueError: If shapes do not fit.
+        Arguments and errors are those of `residuals`.
         """
         return self.reduced(self.residuals(T_j_i, uv, depth_i, uv_j, normal_j, K), 1)
 

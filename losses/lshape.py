@@ -95,15 +95,7 @@ class AngleLoss(ResidualLoss):
     def forward(self, T_j_i: Tensor, uv: Tensor, depth_i: Tensor, cos_j: Tensor, K: Tensor) -> Tensor:
         """Mean (or sum) over corners of squared differences of cosines ``()``, ``(B,)`` for a batch of pairs.
 
-        Args:
-            T_j_i: Motion from frame i to frame j ``(4, 4)`` or ``(B, 4, 4)``, in the depths' unit.
-            uv: Corner, end of arm 1, end of arm 2 in frame i ``(C, 3, 2)`` or ``(B, C, 3, 2)`` [px]; NaN for none.
-            depth_i: Their z-depths ``(C, 3)`` or ``(B, C, 3)``; 0 where unknown.
-            cos_j: Cosine of the angle observed in frame j ``(C,)`` or ``(B, C)``; NaN if not observed.
-            K: Calibration matrix ``(3, 3)`` or ``(B, 3, 3)`` [px].
-
-        Raises:
-            ValueError: If shapes do not fit.
+        Arguments and errors are those of `residuals`.
         """
         return self.reduced(self.residuals(T_j_i, uv, depth_i, cos_j, K), 1)
 
@@ -186,13 +178,7 @@ class CollinearityLoss(ResidualLoss):
     def forward(self, p: Tensor, mask: Tensor | None = None) -> Tensor:
         """Mean (or sum) over corners of both arms' mean squared offsets ``()``, ``(B,)`` for a batch.
 
-        Args:
-            p: Points of each arm ``(C, 2, M, 3)`` or ``(B, C, 2, M, 3)`` [m].
-            mask: Which points exist ``(C, 2, M)`` or ``(B, C, 2, M)``, bool; all by default.
-
-        Raises:
-            ValueError: If shapes do not fit.
-            TypeError: If the mask is not bool.
+        Arguments and errors are those of `residuals`.
         """
         residuals = self.residuals(p, mask)
         total = reduce(residuals, Reduction.SUM, self.kernel, self.delta, axes=3)

@@ -49,16 +49,7 @@ class ReprojectionLoss(ResidualLoss):
     def forward(self, T_c_w: Tensor, p_w: Tensor, uv: Tensor, K: Tensor, mask: Tensor | None = None) -> Tensor:
         """Mean (or sum) over observations of squared pixels ``()``, ``(B,)`` for a batch.
 
-        Args:
-            T_c_w: World-to-camera poses ``(W, 4, 4)`` or ``(B, W, 4, 4)``.
-            p_w: Anchors ``(N, 3)`` or ``(B, N, 3)`` [any unit, that of the poses].
-            uv: Observed pixels ``(W, N, 2)`` or ``(B, W, N, 2)``; NaN where not observed.
-            K: Calibration matrix ``(3, 3)`` or ``(B, 3, 3)`` [px].
-            mask: Which anchor was seen in which frame ``(W, N)`` or ``(B, W, N)``, bool; all by default.
-
-        Raises:
-            ValueError: If shapes do not fit.
-            TypeError: If the mask is not bool.
+        Arguments and errors are those of `residuals`.
         """
         return self.reduced(self.residuals(T_c_w, p_w, uv, K, mask), 2)
 

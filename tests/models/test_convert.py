@@ -79,14 +79,10 @@ def test_what_training_left_beside_the_network_is_passed_over(tmp_path, upstream
     assert convert_upstream(tmp_path / "w.pth.tar", tmp_path / "out.safetensors").variant == Variant.PRUNED.value
 
 
-def test_damaged_files_are_named(tmp_path, rng):
+def test_damaged_files_are_named(tmp_path):
     torch.save(FastDepth(Variant.PRUNED).state_dict(), tmp_path / "w.pt", _use_new_zipfile_serialization=False)
     whole = (tmp_path / "w.pt").read_bytes()
     for cut in (0, 1, 20, 3000, len(whole) // 2, len(whole) - 3):
         (tmp_path / "cut.pt").write_bytes(whole[:cut])
         with pytest.raises(WeightsError, match=r"cut\.pt"):
             read_upstream(tmp_path / "cut.pt")
-    for _ in range(50):
-        (tmp_path / "noise.pt").write_bytes(rng.integers(0, 256, 200, dtype="uint8").tobytes())
-        with pytest.raises(WeightsError, match=r"noise\.pt"):
-            read_upstream(tmp_path / "noise.pt")

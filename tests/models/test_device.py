@@ -7,29 +7,27 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from small_depth import narrow_fastdepth
 
 from edgeslam_torch.config import DepthConfig
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.frontend.depth_network import DepthPredictor, open_depth
 from edgeslam_torch.frontend.onnx_session import open_session
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
+from edgeslam_torch.models.checkpoint import save_checkpoint
 from edgeslam_torch.models.device import find_device, onnx_providers
-from edgeslam_torch.models.fastdepth import Widths
 from edgeslam_torch.models.onnx.fold import deployed
 from edgeslam_torch.models.record import Metadata
 
 METADATA = Metadata(input_height=64, input_width=96, focal_px=80.0)
-SMALL = Widths((4,) + (8,) * 13, (8,) * 5)
 CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
 CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "w.safetensors"
-    save_checkpoint(build_network(METADATA, SMALL).eval(), METADATA, path)
+    save_checkpoint(narrow_fastdepth(METADATA), METADATA, path)
     return path
 
 
@@ -108,7 +106,7 @@ def test_other_names_are_refused(weights, device):
 
 def test_the_deployed_network_leaves_nothing_on_the_processor():
     """On the meta device, tensors have no values: one that was left elsewhere would not go with them."""
-    network = deployed(build_network(METADATA, SMALL), METADATA).to("meta")
+    network = deployed(narrow_fastdepth(METADATA), METADATA).to("meta")
     log_depth, sigma = network(torch.zeros(1, 3, 64, 96, device="meta"))
     assert log_depth.shape == sigma.shape == (1, 1, 32, 48)
     assert log_depth.device.type == sigma.device.type == "meta"

@@ -21,7 +21,6 @@ from torch import nn
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.convert import convert_upstream, read_upstream
 from edgeslam_torch.models.fastdepth import FastDepth, Variant
-from edgeslam_torch.models.inert_pickle import Call, InertPickle, Name
 
 MAGIC = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."
 PROTOCOL = b"\x80\x02M\xe9\x03."
@@ -111,19 +110,13 @@ PROGRAMS = {
         LIST_OF_PAIRS + b"ccollections\nOrderedDict\nq\x01" + b"h\x01h\x00\x85R0" * 30_000
     ),
     # Nonsense.
-    "an empty pickle": legacy(b""),
     "nothing on the stack": legacy(b"0"),
-    "no mark": legacy(b"t"),
-    "a memo that nobody wrote": legacy(b"h\x07"),
-    "items for no list": legacy(b"N(K\x01e"),
     "a call of a number": legacy(b"K\x01)R"),
     "a call without arguments": legacy(b"ctorch._utils\n_rebuild_tensor_v2\n)R"),
     "a tensor of nothing": legacy(table("a", b"ctorch._utils\n_rebuild_tensor_v2\n(NNNNtR"), {}),
     "a text instruction": legacy(b"I1\n"),
-    "an extension": legacy(b"\x82\x01"),
     "bytes of nobody's": legacy(b"}", {"7": block(1, bytes(4))}),
     "keys that are no list": MAGIC + PROTOCOL + SYSTEM + b"\x80\x02}." + b"\x80\x02" + NESTED + b".",
-    "only the beginning": MAGIC + PROTOCOL,
 }
 
 
@@ -235,9 +228,3 @@ def test_a_module_inside_itself_ends(tmp_path):
     (tmp_path / "w.pth").write_bytes(legacy(itself))
     with pytest.raises(WeightsError, match="more than 5000 modules"):
         read_upstream(tmp_path / "w.pth")
-
-
-def test_nothing_is_looked_up_or_called():
-    """Even an allowed name is not resolved."""
-    program = b"\x80\x02cos\nsystem\n" + text("exit 1") + b"\x85R."
-    assert InertPickle(program, lambda name: True).load() == Call(Name("os", "system"), ("exit 1",))

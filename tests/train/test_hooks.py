@@ -158,12 +158,6 @@ def test_hook_that_is_none_is_an_error_of_one_line(tmp_path, monkeypatch, name):
         named_hooks([name])
 
 
-def test_hook_that_only_watches_changes_nothing(tmp_path):
-    alone, watched = run(tmp_path / "a"), run(tmp_path / "b", Diary())
-    for a, b in zip(alone.network.parameters(), watched.network.parameters(), strict=True):
-        assert torch.equal(a, b)
-
-
 def test_examples_do_what_they_say(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = ("OwnLoss", "CsvLog", "SampleImages", "stop")

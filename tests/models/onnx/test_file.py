@@ -6,26 +6,23 @@ from dataclasses import asdict
 import numpy as np
 import onnx
 import pytest
-import torch
 from onnx import TensorProto, helper, numpy_helper
+from small_depth import narrow_fastdepth
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.frontend.depth_network import DepthPredictor
-from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
-from edgeslam_torch.models.layout import Widths
+from edgeslam_torch.models.checkpoint import save_checkpoint
 from edgeslam_torch.models.onnx.file import parse_onnx, read_onnx
 from edgeslam_torch.models.onnx.graph import build_graph
 from edgeslam_torch.models.record import Metadata
 
 METADATA = Metadata(input_height=64, input_width=96, focal_px=80.0)
-SMALL = Widths((8, 8) + (16,) * 12, (16, 16, 16, 8, 8))
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "w.safetensors"
-    save_checkpoint(build_network(METADATA, SMALL).eval(), METADATA, path)
+    save_checkpoint(narrow_fastdepth(METADATA), METADATA, path)
     return build_graph(path)[0]
 
 

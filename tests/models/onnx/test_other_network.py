@@ -7,12 +7,12 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
+from small_depth import narrow_fastdepth
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.frontend.depth_network import DepthPredictor
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
-from edgeslam_torch.models.layout import Widths
+from edgeslam_torch.models.checkpoint import save_checkpoint
 from edgeslam_torch.models.record import OTHER_NETWORK, Metadata
 
 GREEN = Metadata(
@@ -57,8 +57,6 @@ def test_other_network_gives_the_slam_metres_for_its_camera(tmp_path):
 
 
 def test_weights_without_a_graph_cannot_be_another_network(tmp_path):
-    widths = Widths((8, 8) + (16,) * 12, (16, 16, 16, 8, 8))
-    fastdepth = Metadata(input_height=64, input_width=96, focal_px=80.0)
+    save_checkpoint(narrow_fastdepth(), GREEN, tmp_path / "w.safetensors")
     with pytest.raises(WeightsError, match="other networks come as ONNX files"):
-        save_checkpoint(build_network(fastdepth, widths).eval(), GREEN, tmp_path / "w.safetensors")
         DepthPredictor(tmp_path / "w.safetensors")
