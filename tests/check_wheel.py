@@ -25,12 +25,6 @@ def repository_files(root: Path = ROOT) -> list[str]:
     return sorted({name for name in listed if (root / name).is_file() or (root / name).is_symlink()})
 
 
-def expected_in_wheel(files: list[str]) -> set[str]:
-    """Files of the package as names inside a wheel."""
-    linked = {f"edgeslam_torch/{name}" for name in files if name.split("/")[0] in LINKED}
-    return linked | {name for name in files if name.startswith("edgeslam_torch/")}
-
-
 def build(folder: Path, out: Path, kind: str) -> Path:
     """Wheel or sdist of a source folder."""
     subprocess.run(
@@ -73,40 +67,32 @@ def differences(what: str, held: set[str], expected: set[str]) -> list[str]:
     return surplus + [f"{what}: {name} is missing" for name in sorted(expected - held)]
 
 
-def wheel_problems(wheel: Path, expected: set[str]) -> list[str]:
-    """What is wrong with the wheel, in words; empty when nothing is."""
+def problems(dist: Path) -> list[str]:
+    """Build everything, the wheel and the sdist into ``dist``; what is wrong, in words.
+
+    All in the repository belongs into the sdist, examples and tests too, but neither links nor CI.
+    """
+    files = repository_files()
+    links = {f"edgeslam_torch/{name}" for name in LINKED}
+    package = {name if name.startswith("edgeslam_torch/") else f"edgeslam_torch/{name}" for name in files
+               if name.split("/")[0] in ("edgeslam_torch", *LINKED)}  # fmt: skip
+    wheel, sdist = build(ROOT, dist, "wheel"), build(ROOT, dist, "sdist")
     with zipfile.ZipFile(wheel) as archive:
         held = archive.namelist()
     found = [f"wheel: {name} is there twice" for name in set(held) if held.count(name) > 1]
-    found += differences("wheel", {name for name in held if ".dist-info/" not in name}, expected)
+    found += differences("wheel", {name for name in held if ".dist-info/" not in name}, package - links)
     licences = [name for name in held if name.endswith(("/LICENSE", "/NOTICE"))]
-    if len(licences) != 2:
-        found.append(f"wheel: LICENSE and NOTICE belong there, found {licences}")
-    return found
-
-
-def sdist_problems(sdist: Path, files: list[str]) -> list[str]:
-    """Everything in the repository belongs into the sdist, examples and tests too, but neither links nor CI."""
+    found += [] if len(licences) == 2 else [f"wheel: LICENSE and NOTICE belong there, found {licences}"]
     with tarfile.open(sdist) as archive:
-        held = {name.split("/", 1)[1] for name in archive.getnames()}
-    links = {f"edgeslam_torch/{name}" for name in LINKED}
-    expected = {name for name in files if not name.startswith(NOT_DISTRIBUTED)} - links
-    return differences("sdist", held, expected | {"PKG-INFO"})
-
-
-def problems(dist: Path) -> list[str]:
-    """Build everything, the wheel and the sdist into ``dist``; what is wrong, in words."""
-    files = repository_files()
-    links = {f"edgeslam_torch/{name}" for name in LINKED}
-    wheel, sdist = build(ROOT, dist, "wheel"), build(ROOT, dist, "sdist")
-    found = wheel_problems(wheel, expected_in_wheel(files) - links) + sdist_problems(sdist, files)
+        held = [name.split("/", 1)[1] for name in archive.getnames()]
+    distributed = {name for name in files if not name.startswith(NOT_DISTRIBUTED)} - links
+    found += differences("sdist", set(held), distributed | {"PKG-INFO"})
     with tempfile.TemporaryDirectory() as folder:
         for what, source in (
             ("a checkout without links", copy_without_links(files, Path(folder) / "copy")),
             ("the sdist", unpacked(sdist, Path(folder) / "sdist")),
         ):
-            other = checksums(build(source, Path(folder) / what, "wheel"))
-            here = checksums(wheel)
+            other, here = checksums(build(source, Path(folder) / what, "wheel")), checksums(wheel)
             found += differences(f"wheel from {what}", set(other), set(here))
             found += [f"wheel from {what}: {n} differs" for n in here.keys() & other.keys() if here[n] != other[n]]
     return found

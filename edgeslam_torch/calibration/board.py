@@ -18,6 +18,8 @@ _MAX_VIEWS = 80
 """Views of a long video that are used, evenly spaced; the solver's time grows with their number."""
 _GRID = (8, 6)
 """Grid of cells for measuring coverage."""
+_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+"""End of the refinement of corners [iterations, px]."""
 _MIN_CHARUCO = 8
 _MIN_TAGS = 4
 _GROUPS = 5
@@ -132,8 +134,7 @@ def _chessboard(grey: np.ndarray, size: tuple[int, int], exact: bool) -> FloatAr
     # As wide as possible without reaching the next corner: on 26 pictures of a real Tello, half the spacing gives
     # 0.32 px RMS, a fifth of it 0.70 px.
     half = int(np.clip(0.5 * spacing, 2, 30))
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
-    refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), criteria)
+    refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), _CRITERIA)
     return np.asarray(refined, dtype=np.float32).reshape(-1, 2)
 
 
@@ -173,8 +174,7 @@ def _find_aprilgrid(name: str, grey: np.ndarray, board: Board) -> View | None:
     # The gaps' black squares touch the tags' corners: a third of the gap reaches no other edge.
     side = float(np.median(np.linalg.norm(uv - np.roll(uv, 1, axis=1), axis=2)))
     half = int(np.clip(side * board.tag_spacing / 3.0, 2, 10))
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
-    refined = cv2.cornerSubPix(grey, uv.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria)
+    refined = cv2.cornerSubPix(grey, uv.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), _CRITERIA)
     exact: FloatArray = np.asarray(refined, dtype=np.float64).reshape(-1, 2)
     places = [_aprilgrid_corners(number, board, first, up) for first in range(4) for up in (True, False)]
     misses = [_homography_miss(place[:, :2], exact) for place in places]

@@ -14,7 +14,7 @@ import numpy as np
 from edgeslam_torch.commands.flying._signals import Signals, say
 
 if TYPE_CHECKING:
-    from edgeslam_torch.drone.tello import StateMessage, Tello
+    from edgeslam_torch.drone.tello import Tello
     from edgeslam_torch.readers.live import LiveSource
     from edgeslam_torch.terminal.progress import Progress
     from edgeslam_torch.writers.flight_writer import FlightWriter
@@ -62,14 +62,14 @@ def main(args: argparse.Namespace) -> int:
     with Progress("waits for the drone" if is_drone else "waits for the camera") as progress, Signals() as signals:
         try:
             if is_drone:
-                source, tello, messages = open_tello(args.source, args.camera, args.max_frames, args.fly)
+                source, tello = open_tello(args.source, args.camera, args.max_frames, args.fly)
             else:
-                source, tello, messages = open_live(args.source, args.camera, args.max_frames), None, []
+                source, tello = open_live(args.source, args.camera, args.max_frames), None
         except KeyboardInterrupt:
             say("interrupted; nothing was recorded")
             return signals.exit_code
         try:
-            _record(args, source, messages, tello if args.fly else None, signals, progress)
+            _record(args, source, tello if args.fly else None, signals, progress)
         finally:
             source.close()
     return signals.exit_code
@@ -78,7 +78,6 @@ def main(args: argparse.Namespace) -> int:
 def _record(
     args: argparse.Namespace,
     source: "LiveSource",
-    messages: "list[StateMessage]",
     tello: "Tello | None",
     signals: Signals,
     progress: "Progress",
@@ -100,11 +99,11 @@ def _record(
         say(f"recording to {folder}; Ctrl-C ends it")
         # From here on no signal interrupts a flight or its landing; without a flight, a second signal does.
         signals.tell(source.end, patient=tello is not None)
-        status = _Status(source, messages)
+        status = _Status(source)
         progress.phase("recording", args.max_frames, "picture")
         progress.words = status.text
         try:
-            _write_frames(source, writer, messages, tello, args.duration, progress, status)
+            _write_frames(source, writer, tello, args.duration, progress, status)
         except EdgeSlamError as error:
             failure = error
         finally:
@@ -113,7 +112,7 @@ def _record(
                 threading.Thread(target=say, args=("landing",), daemon=True).start()
             source.close()  # lands; its state messages are recorded too
         try:
-            _write_states(writer, messages)
+            _write_states(writer, source)
         except EdgeSlamError as error:
             failure = failure or error
         say(f"{writer.frames} frames, {writer.states} state messages in {folder}")
@@ -128,7 +127,6 @@ def _record(
 def _write_frames(
     source: "LiveSource",
     writer: "FlightWriter",
-    messages: "list[StateMessage]",
     tello: "Tello | None",
     duration_s: float | None,
     progress: "Progress",
@@ -140,7 +138,7 @@ def _write_frames(
     for frame in source.frames():
         writer.add_frame(frame)
         progress.advance()
-        _write_states(writer, messages)
+        _write_states(writer, source)
         if duration_s is not None and time.monotonic() - begin > duration_s:
             break
         check()
@@ -149,8 +147,8 @@ def _write_frames(
 class _Status:
     """The pilot's action, the drone's own state, and the time without a picture."""
 
-    def __init__(self, source: "LiveSource", messages: "list[StateMessage]") -> None:
-        self._source, self._messages = source, messages
+    def __init__(self, source: "LiveSource") -> None:
+        self._source = source
         self._read, self._flown_m, self._at_s = 0, 0.0, math.nan
         self.doing = ""
         """What the pilot does."""
@@ -164,21 +162,21 @@ class _Status:
         if not self.ends and self._source.silent_s >= 1.0:
             parts.append(f"no picture for {self._source.silent_s:.0f} s")
         sample = None
-        for message in self._messages[self._read :]:
+        for message in self._source.messages[self._read :]:
             sample = message.sample()
             step_m = float(np.linalg.norm(sample.velocity_m_s)) * min(sample.stamp_s - self._at_s, _GAP_S)
             self._flown_m += step_m if math.isfinite(step_m) else 0.0
             self._at_s = sample.stamp_s
             self._read += 1
-        if self._messages:
-            sample = sample or self._messages[-1].sample()
+        if self._source.messages:
+            sample = sample or self._source.messages[-1].sample()
             parts += [f"battery {100 * sample.battery:.0f} %", height_text(sample), f"{self._flown_m:.1f} m flown"]
         return ", ".join(part for part in parts if part)
 
 
-def _write_states(writer: "FlightWriter", messages: "list[StateMessage]") -> None:
-    while writer.states < len(messages):
-        writer.add_state(messages[writer.states])
+def _write_states(writer: "FlightWriter", source: "LiveSource") -> None:
+    while writer.states < len(source.messages):
+        writer.add_state(source.messages[writer.states])
 
 
 def _start_pilot(tello: "Tello", status: "_Status") -> Callable[[], None]:

@@ -153,18 +153,24 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _source(args: argparse.Namespace) -> "Source":
-    """The source, or the requested part of a recording."""
+    """The source, the requested part of a recording, or a live source that is recorded."""
     from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.readers.source import LIVE_SCHEMES, Recording, open_source
 
-    whole = args.start == 0 and args.stride == 1
-    if not whole and args.source.startswith(LIVE_SCHEMES):
+    whole, is_live = args.start == 0 and args.stride == 1, args.source.startswith(LIVE_SCHEMES)
+    if is_live and not whole:
         raise ConfigError(f"{args.source}: --start and --stride are for recordings")
-    if args.record is not None:
-        return _recorded(args)
+    if args.record is not None and not is_live:
+        raise ConfigError(f"{args.source}: --record is for live sources ({', '.join(LIVE_SCHEMES)})")
     source = open_source(
         args.source, args.camera, args.telemetry, args.max_frames, args.topic, args.imu, args.imu_model
     )
+    if args.record is not None:
+        from edgeslam_torch.readers.live import LiveSource
+        from edgeslam_torch.writers.tee import RecordedLive
+
+        assert isinstance(source, LiveSource)
+        return RecordedLive(source, args.record, args.lossless)
     return source if whole or not isinstance(source, Recording) else source.part(args.start, args.stride)
 
 
@@ -172,24 +178,6 @@ def _new_folder(folder: Path) -> Path:
     """``runs/NAME``, or ``runs/NAME-2`` and so on beside older runs: none is replaced unless ``--out`` names it."""
     candidates = (folder if number == 1 else folder.with_name(f"{folder.name}-{number}") for number in count(1))
     return next(path for path in candidates if not path.exists() or (path.is_dir() and not any(path.iterdir())))
-
-
-def _recorded(args: argparse.Namespace) -> "Source":
-    from edgeslam_torch.errors import ConfigError
-    from edgeslam_torch.readers.live import open_live, open_tello
-    from edgeslam_torch.readers.source import LIVE_SCHEMES
-    from edgeslam_torch.writers.tee import RecordedLive
-
-    if not args.source.startswith(LIVE_SCHEMES):
-        raise ConfigError(f"{args.source}: --record is for live sources ({', '.join(LIVE_SCHEMES)})")
-    if args.telemetry is not None:
-        raise ConfigError("--telemetry is for recordings; a live drone sends its own")
-    if args.topic:
-        raise ConfigError("--topic is for ROS bags; a live source has none")
-    if args.source.startswith("tello://"):
-        source, _, messages = open_tello(args.source, args.camera, args.max_frames)
-        return RecordedLive(source, messages, args.record, args.lossless)
-    return RecordedLive(open_live(args.source, args.camera, args.max_frames), [], args.record, args.lossless)
 
 
 def _take_its_camera(source: "Source", atlas: "SavedAtlas") -> bool:

@@ -14,20 +14,6 @@ _HOLE_SHARE = 0.05
 """Ten messages in a row missing are a hole; holes over more than this share of the video are a warning."""
 
 
-def telemetry_file(folders: Sequence[Path], given: str | Path | None) -> Path | None:
-    """The given file, or the source's own ``telemetry.csv``.
-
-    Raises:
-        SourceError: If the given file does not exist.
-    """
-    if given is not None:
-        path = Path(given).expanduser()
-        if not path.is_file():
-            raise SourceError(f"{path}: no such telemetry file")
-        return path
-    return next((folder / TELEMETRY for folder in folders if (folder / TELEMETRY).is_file()), None)
-
-
 def telemetry_gap(samples: Sequence[TelemetrySample], first_s: float, last_s: float) -> str | None:
     """Warning about the part of a video without telemetry; None for small gaps or without any telemetry.
 

@@ -57,12 +57,20 @@ class LiveSource(Steps):
         self,
         location: str,
         feed: Feed,
-        telemetry: list[TelemetrySample],
         camera: str | Path | None,
         max_frames: int | None,
-        is_drone: bool,
+        telemetry: list[TelemetrySample] | None = None,
+        messages: list[StateMessage] | None = None,
     ) -> None:
         """Wait for the first picture, which has the size.
+
+        Args:
+            location: Address.
+            feed: Its pictures.
+            camera: Calibration file or preset.
+            max_frames: Maximum number of frames.
+            telemetry: Of a drone; it grows.
+            messages: What the drone says, as it says it; it grows.
 
         Raises:
             SourceError: If none comes.
@@ -70,12 +78,14 @@ class LiveSource(Steps):
         """
         self.location = location
         self.name = re.sub(r"[^A-Za-z0-9.-]+", "_", location).strip("_")[:_MAX_NAME] or "live"
-        self.telemetry = telemetry
+        self.telemetry = telemetry if telemetry is not None else []
+        self.messages = messages if messages is not None else []
         self.length = max_frames
         self.problems: list[Problem] = []
         self.silent_s = 0.0
         """Since the last picture."""
         self._feed = feed
+        is_drone = telemetry is not None
         self._silence_s = RESTART_S if is_drone else SILENCE_S
         self._told_to_end = self._closed = False
         first = feed.wait(0, FIRST_PICTURE_S)
@@ -289,13 +299,13 @@ def open_live(spec: str, camera: str | Path | None = None, max_frames: int | Non
             raise SourceError(f"{spec}: give webcam:N with a number, such as webcam:0")
         device = int(number)
     shown = without_password(spec)
-    return LiveSource(shown, CaptureFeed(device, shown), [], camera, max_frames, is_drone=False)
+    return LiveSource(shown, CaptureFeed(device, shown), camera, max_frames)
 
 
 def open_tello(
     spec: str, camera: str | Path | None = None, max_frames: int | None = None, allow_motion: bool = False
-) -> tuple[LiveSource, Tello, list[StateMessage]]:
-    """A drone as a source, with its client and the growing list of its state messages.
+) -> tuple[LiveSource, Tello]:
+    """A drone as a source, with its client.
 
     Raises:
         SourceError: If PyAV is missing, a port is taken, or no picture comes.
@@ -316,4 +326,4 @@ def open_tello(
     except BaseException:
         tello.close()
         raise
-    return LiveSource(spec, feed, telemetry, camera, max_frames, is_drone=True), tello, messages
+    return LiveSource(spec, feed, camera, max_frames, telemetry, messages), tello

@@ -5,10 +5,12 @@ import queue
 import threading
 import time
 from collections.abc import Iterator
-from typing import Protocol
+from contextlib import suppress
+from typing import Any, Protocol
 
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.imu import ImuModel, ImuReadings, Reading
+from edgeslam_torch.readers.read_ahead import offered, read_ahead
 from edgeslam_torch.types import Frame, TelemetrySample
 
 REALTIME_QUEUE = 15
@@ -90,40 +92,17 @@ def at_their_pace(frames: Iterator[Frame], dropped: Counter, waiting: int = REAL
         dropped: Counts dropped frames.
         waiting: Length of the queue.
     """
-    buffer: queue.Queue[Frame | None] = queue.Queue()
-    stop = threading.Event()
-    failure: list[BaseException] = []
+    begin_s: list[float] = []
 
-    def feed() -> None:
-        begin_wall, begin_stamp = time.monotonic(), None
-        try:
-            for frame in frames:
-                begin_stamp = frame.stamp_s if begin_stamp is None else begin_stamp
-                due_s = begin_wall + frame.stamp_s - begin_stamp
-                if stop.wait(max(0.0, due_s - time.monotonic())):
-                    return
-                while buffer.qsize() >= waiting:
-                    try:
-                        buffer.get_nowait()
-                    except queue.Empty:
-                        break
-                    dropped.value += 1
-                buffer.put(frame)
-        except BaseException as error:  # passed on: raised in the consumer's thread
-            failure.append(error)
-        finally:
-            buffer.put(None)
+    def at_its_time(buffer: "queue.Queue[Any]", frame: Frame, stop: threading.Event) -> bool:
+        if not begin_s:
+            begin_s.append(time.monotonic() - frame.stamp_s)
+        if stop.wait(max(0.0, begin_s[0] + frame.stamp_s - time.monotonic())):
+            return False
+        with suppress(queue.Empty):
+            while buffer.full():
+                buffer.get_nowait()
+                dropped.value += 1
+        return offered(buffer, frame, stop)
 
-    worker = threading.Thread(target=feed, name="camera-pace", daemon=True)
-    worker.start()
-    try:
-        while (frame := buffer.get()) is not None:
-            yield frame
-        if failure:
-            raise failure[0]
-    finally:
-        stop.set()
-        worker.join()
-        close = getattr(frames, "close", None)
-        if close is not None:
-            close()
+    return read_ahead(frames, waiting, at_its_time)

@@ -2,8 +2,8 @@
 
 import queue
 import threading
-from collections.abc import Generator, Iterator
-from typing import TypeVar
+from collections.abc import Callable, Generator, Iterator
+from typing import Any, TypeVar
 
 T = TypeVar("T")
 
@@ -16,45 +16,8 @@ class _End:
         self.error = error
 
 
-def read_ahead(items: Iterator[T], depth: int = 1) -> Generator[T]:
-    """The same items in the same order, read by one background thread, at most ``depth`` + 1 items ahead.
-
-    An exception of ``items`` is raised here, after the items that came before it. Closing the generator stops the
-    thread.
-    """
-    buffer: queue.Queue[T | _End] = queue.Queue(maxsize=depth)
-    stop = threading.Event()
-    worker = threading.Thread(target=_fill, args=(items, buffer, stop), name="read-ahead", daemon=True)
-    worker.start()
-    try:
-        while True:
-            item = buffer.get()
-            if isinstance(item, _End):
-                if item.error is not None:
-                    raise item.error
-                return
-            yield item
-    finally:
-        stop.set()
-        worker.join()
-
-
-def _fill(items: Iterator[T], buffer: "queue.Queue[T | _End]", stop: threading.Event) -> None:
-    error: BaseException | None = None
-    try:
-        for item in items:
-            if not _offer(buffer, item, stop):
-                return
-    except BaseException as caught:  # passed on: raised in the consumer's thread
-        error = caught
-    finally:
-        close = getattr(items, "close", None)
-        if close is not None:
-            close()
-    _offer(buffer, _End(error), stop)
-
-
-def _offer(buffer: "queue.Queue[T | _End]", item: "T | _End", stop: threading.Event) -> bool:
+def offered(buffer: "queue.Queue[Any]", item: Any, stop: threading.Event) -> bool:
+    """Put an item into a queue once there is room; False when told to stop."""
     while not stop.is_set():
         try:
             buffer.put(item, timeout=_POLL_S)
@@ -62,3 +25,45 @@ def _offer(buffer: "queue.Queue[T | _End]", item: "T | _End", stop: threading.Ev
             continue
         return True
     return False
+
+
+def read_ahead(
+    items: Iterator[T], depth: int = 1, offer: "Callable[[queue.Queue[Any], T, threading.Event], bool]" = offered
+) -> Generator[T]:
+    """The same items in the same order, read by one background thread, at most ``depth`` + 1 items ahead.
+
+    An exception of ``items`` is raised here, after the items that came before it. Closing the generator stops the
+    thread.
+
+    Args:
+        items: Read in the thread.
+        depth: Length of the queue.
+        offer: Puts an item into the queue, as `offered` does.
+    """
+    buffer: queue.Queue[T | _End] = queue.Queue(maxsize=depth)
+    stop = threading.Event()
+
+    def fill() -> None:
+        error: BaseException | None = None
+        try:
+            for item in items:
+                if not offer(buffer, item, stop):
+                    return
+        except BaseException as caught:  # passed on: raised in the consumer's thread
+            error = caught
+        finally:
+            close = getattr(items, "close", None)
+            if close is not None:
+                close()
+        offered(buffer, _End(error), stop)
+
+    worker = threading.Thread(target=fill, name="read-ahead", daemon=True)
+    worker.start()
+    try:
+        while not isinstance(item := buffer.get(), _End):
+            yield item
+        if item.error is not None:
+            raise item.error
+    finally:
+        stop.set()
+        worker.join()

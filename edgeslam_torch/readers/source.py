@@ -195,7 +195,8 @@ def open_source(
         content = _content(path)
     images.check_trackable(content.size, path)
     folders = [path, content.folder] if path.is_dir() else [content.folder]
-    telemetry_file = flight_folder.telemetry_file(folders, telemetry)
+    own_files = (folder / flight_folder.TELEMETRY for folder in folders)
+    telemetry_file = _file(telemetry, "--telemetry") or next((file for file in own_files if file.is_file()), None)
     samples, remarks = (list(content.telemetry), []) if telemetry_file is None else read_telemetry(telemetry_file)
     model, readings, imu_warnings = _imu_of(content, folders, imu, imu_model, camera)
     default = content.default_camera

@@ -2,28 +2,18 @@
 
 import math
 from bisect import bisect_right
-from collections.abc import Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from edgeslam_torch.terminal.progress import Progress
 from edgeslam_torch.types import FloatArray, Frame, SlamOutput, TelemetrySample
 
+if TYPE_CHECKING:
+    from edgeslam_torch.readers.source import Source
+
 _STEP = 0.1
 """Least distance between points of the way [published unit]."""
-
-
-class RunSource(Protocol):
-    """What the progress line reads of a source."""
-
-    @property
-    def length(self) -> int | None:
-        """Expected number of frames; None if unknown."""
-
-    @property
-    def telemetry(self) -> Sequence[TelemetrySample]:
-        """State messages so far."""
 
 
 class RunProgress(Progress):
@@ -31,11 +21,11 @@ class RunProgress(Progress):
 
     def __init__(self, what: str, redraw: bool | None = None) -> None:
         super().__init__(what, redraw=redraw)
-        self._source: RunSource | None = None
+        self._source: Source | None = None
         self._output: SlamOutput | None = None
         self._path = PathLength()
 
-    def follow(self, source: RunSource) -> None:
+    def follow(self, source: "Source") -> None:
         """The frames come from here."""
         self._source = source
         self.phase("loading the system")

@@ -2,23 +2,19 @@
 
 import logging
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from edgeslam_torch.files.plain import subfolder, write_image
-from edgeslam_torch.types import Frame, Observations, SlamOutput
+from edgeslam_torch.types import Frame, SlamOutput
+
+if TYPE_CHECKING:
+    from edgeslam_torch.run import Slam
 
 logger = logging.getLogger(__name__)
 
 FOLDER = "images"
 _JPEG_QUALITY = 95
 """As cameras store them; a photogrammetry program sees no difference to the original."""
-
-
-class _Slam(Protocol):
-    """The part of `EdgeSlam` that is used."""
-
-    def observations(self) -> Observations:
-        """Of the final map's keyframes."""
 
 
 class KeyframeImages:
@@ -48,7 +44,7 @@ class KeyframeImages:
             self._failed = True
             logger.warning("images of keyframes are not kept any more (%s)", error.strerror or error)
 
-    def on_finish(self, slam: _Slam) -> None:
+    def on_finish(self, slam: "Slam") -> None:
         """Remove the pictures of frames that became no keyframes."""
         became = {_name(stamp_s) for stamp_s in slam.observations().stamps_s.tolist()}
         for name in self._may_become.keys() - became:

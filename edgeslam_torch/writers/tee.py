@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from edgeslam_torch.drone.tello import StateMessage
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.listing import Problem
@@ -31,12 +30,11 @@ class RecordedLive(Steps):
     groundtruth: Path | None = None
     live = True
 
-    def __init__(self, source: LiveSource, messages: list[StateMessage], folder: Path, lossless: bool) -> None:
+    def __init__(self, source: LiveSource, folder: Path, lossless: bool) -> None:
         """Open the folder.
 
         Args:
             source: Source to record.
-            messages: Growing list of a drone's state messages; empty without a drone.
             folder: Folder of the recording.
             lossless: PNG, so that the pictures are bit-identical.
 
@@ -49,7 +47,7 @@ class RecordedLive(Steps):
         self.length: int | None = source.length
         self.problems: list[Problem] = source.problems
         self.warnings: list[str] = source.warnings
-        self._source, self._messages = source, messages
+        self._source = source
         try:
             self._writer = FlightWriter(folder, source.camera, source.location.startswith("tello://"), lossless)
         except OutputError:
@@ -94,8 +92,8 @@ class RecordedLive(Steps):
             self._write_states()
 
     def _write_states(self) -> None:
-        while self._failure is None and self._writer.states < len(self._messages):
-            self._guarded(partial(self._writer.add_state, self._messages[self._writer.states]))
+        while self._failure is None and self._writer.states < len(self._source.messages):
+            self._guarded(partial(self._writer.add_state, self._source.messages[self._writer.states]))
 
     def _guarded(self, write: Callable[[], None]) -> None:
         """After the first failure nothing more is written; the queue is still drained, so that the producer never

@@ -1,8 +1,8 @@
 import signal
 import threading
 
-import numpy as np
 import pytest
+from fake_feed import FakeFeed
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.drone.emulator.server import TelloEmulator
@@ -11,25 +11,8 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.live import LiveSource
 
 
-class FakeFeed:
-    """Pictures that are there at once, numbered with gaps, as a slow taker sees them."""
-
-    def __init__(self, counts):
-        self.pictures = [Picture(0.1 * c, np.full((48, 64, 3), c, np.uint8), c) for c in counts]
-        self.closed = 0
-
-    def wait(self, after_count, timeout_s):
-        return next((p for p in self.pictures if p.count > after_count), None)
-
-    def remarks(self):
-        return ["3 packets refused"]
-
-    def close(self):
-        self.closed += 1
-
-
 def live(feed):
-    return LiveSource("webcam:0", feed, [], None, None, is_drone=False)
+    return LiveSource("webcam:0", feed, None, None)
 
 
 def test_frames_carry_the_gaps_of_what_was_missed():

@@ -6,7 +6,6 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.source import open_source
 
 av = pytest.importorskip("av")
@@ -83,13 +82,6 @@ def test_a_cut_file_is_still_said_to_be_damaged(tmp_path):
     source = open_source(path)
     count = len(list(source.frames()))
     assert 0 < count < 80 and "damaged" in source.problems[-1].reason
-
-
-def test_raw_panoramas_of_an_insta360_are_refused_with_advice(tmp_path):
-    for name in ("VID_01.insv", "a.360"):
-        (tmp_path / name).write_bytes(b"x" * 100)
-        with pytest.raises(SourceError, match="export a flat video"):
-            open_source(tmp_path / name)
 
 
 def test_a_picture_twice_as_wide_as_high_is_doubted(tmp_path, write_images):

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from fake_feed import FakeFeed
 from free_ports import free_ports
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.drone.emulator.link import LinkFaults
 from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
 from edgeslam_torch.drone.tello import StateMessage
-from edgeslam_torch.drone.video_stream import Picture
 from edgeslam_torch.readers.live import LiveSource, open_tello
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.writers import flight_writer, tee
@@ -28,8 +28,8 @@ def address():
 
 
 def test_a_recorded_live_source_gives_again_what_it_gave(address, tmp_path):
-    source, _, messages = open_tello(address, max_frames=25)
-    live = RecordedLive(source, messages, tmp_path / "flight", lossless=True)
+    source, _ = open_tello(address, max_frames=25)
+    live = RecordedLive(source, tmp_path / "flight", lossless=True)
     seen = list(live.frames())
     assert not live.problems
     again = open_source(tmp_path / "flight")
@@ -60,10 +60,10 @@ def test_a_writer_that_fails_ends_the_recording_and_not_the_flight(tmp_path, mon
         return write(self, *args)
 
     monkeypatch.setattr(getattr(flight_writer, owner), name, fail)
-    feed = ManyPictures(40)
-    telemetry, messages = [], feed.messages
-    source = LiveSource("tello://test", feed, telemetry, None, 40, is_drone=True)
-    live = RecordedLive(source, messages, tmp_path / "flight", lossless=False)
+    feed = FakeFeed(range(1, 41))
+    messages = [StateMessage(0.1 * count, "bat:90;", {"bat": 90.0}) for count in range(1, 41)]
+    source = LiveSource("tello://test", feed, None, 40, [], messages)
+    live = RecordedLive(source, tmp_path / "flight", lossless=False)
     assert len(list(live.frames())) == 40
     assert feed.closed
     assert len(live.problems) == 1
@@ -71,28 +71,6 @@ def test_a_writer_that_fails_ends_the_recording_and_not_the_flight(tmp_path, mon
     again = open_source(tmp_path / "flight")
     assert len(list(again.frames())) >= 1
     assert not again.problems
-
-
-class ManyPictures:
-    """Images without delay, each with a state message."""
-
-    def __init__(self, count):
-        self.count, self.closed = count, 0
-        self.messages = []
-
-    def wait(self, after_count, timeout_s):
-        if after_count >= self.count:
-            return None
-        stamp = 100.0 + 0.1 * after_count
-        if after_count == len(self.messages):
-            self.messages.append(StateMessage(stamp, "bat:90;", {"bat": 90.0}))
-        return Picture(stamp, np.full((48, 64, 3), after_count, np.uint8), after_count + 1)
-
-    def remarks(self):
-        return []
-
-    def close(self):
-        self.closed += 1
 
 
 @pytest.mark.parametrize("name", ["rgb.txt", "moments.csv", "0.png"])
