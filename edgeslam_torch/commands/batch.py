@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.errors import ConfigError, SourceError
-from edgeslam_torch.help.options import EXIT_INTERRUPTED, add_settings, say
+from edgeslam_torch.help.options import EXIT_INTERRUPTED, add_settings, positive_amount, positive_number, say
 
 if TYPE_CHECKING:
     from edgeslam_torch.eval.experiment.runner import Runner
@@ -32,19 +32,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="results; finished flights are not repeated"
     )
-    parser.add_argument("--jobs", type=int, metavar="N", help="flights at a time (default: one a core)")
+    parser.add_argument("--jobs", type=positive_number, metavar="N", help="flights at a time (default: one a core)")
     parser.add_argument(
         "--ray", metavar="auto|ADDRESS", help="run on a Ray cluster ([fleet] extra): auto is this machine's"
     )
-    parser.add_argument("--timeout", type=float, default=3600.0, metavar="S", help="longest flight [s] (default: 3600)")
+    parser.add_argument(
+        "--timeout", type=positive_amount, default=3600.0, metavar="S", help="of one flight (default: 3600)"
+    )
     parser.add_argument(
         "--memory",
-        type=float,
+        type=positive_amount,
         metavar="MB",
         help="most memory of a flight (default: 4000, or an equal share of 80 %% of this machine's if that is less)",
     )
     add_settings(parser, " of all flights")
-    parser.add_argument("--max-frames", type=int, metavar="N", help="stop every flight after N frames")
+    parser.add_argument("--max-frames", type=positive_number, metavar="N", help="stop every flight after N frames")
     parser.add_argument("--seed", type=int, help="seed of the robust estimators (default: 0)")
     parser.add_argument(
         "--map-score", action="store_true", help="compare maps with measured depth too (slower, a gigabyte each)"
@@ -58,12 +60,6 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.fleet.manifest import read_manifests
     from edgeslam_torch.fleet.table import FAILED, counts
 
-    for name, value in (("--jobs", args.jobs), ("--max-frames", args.max_frames)):
-        if value is not None and value < 1:
-            raise ConfigError(f"{name} must be at least 1, got {value}")
-    for name, value in (("--timeout", args.timeout), ("--memory", args.memory)):
-        if value is not None and value <= 0:
-            raise ConfigError(f"{name} must be positive, got {value:g}")
     flights = _without(read_manifests(args.manifest), args.out)
     try:
         rows = run_batch(flights, _settings(args), args.out, _runner(args), say)

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgeslam_torch.help.options import EXIT_INTERRUPTED, add_settings
+from edgeslam_torch.help.options import EXIT_INTERRUPTED, add_settings, positive_number
 
 if TYPE_CHECKING:
     from edgeslam_torch.demo import DemoResult, DemoSettings
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--record-only", action="store_true", help="only write the simulated recording, to DIR/flight")
     parser.add_argument(
         "--flights",
-        type=int,
+        type=positive_number,
         metavar="N",
         help="with --record-only: N recordings with seeds from --seed on, to DIR/flight_0000 and so on, for 'batch'",
     )
@@ -85,8 +85,8 @@ def _record_many(args: argparse.Namespace, settings: "DemoSettings") -> int:
     from edgeslam_torch.demo import record
     from edgeslam_torch.errors import ConfigError
 
-    if not args.record_only or args.flights < 1:
-        raise ConfigError("--flights needs --record-only, and a number of at least 1")
+    if not args.record_only:
+        raise ConfigError("--flights needs --record-only")
     for i in range(args.flights):
         folder = args.out / f"flight_{settings.seed + i:04d}"
         if not (folder / "depth.txt").is_file():  # written last

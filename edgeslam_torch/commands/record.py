@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edgeslam_torch.commands.flying._signals import Signals, say
+from edgeslam_torch.help.options import positive_amount, positive_number
 
 if TYPE_CHECKING:
     from edgeslam_torch.drone.tello import Tello
@@ -37,8 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default: flights/DATE-TIME)")
     parser.add_argument("--camera", metavar="FILE|PRESET", help="calibration that is stored with the recording")
-    parser.add_argument("--duration", type=float, metavar="S", help="stop after this time (default: until Ctrl-C)")
-    parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
+    parser.add_argument("--duration", type=positive_amount, metavar="S", help="stop then (default: at Ctrl-C)")
+    parser.add_argument("--max-frames", type=positive_number, metavar="N", help="stop after N frames")
     parser.add_argument("--lossless", action="store_true", help="PNG instead of JPEG (quality 95)")
     parser.add_argument(
         "--fly",
@@ -57,8 +58,6 @@ def main(args: argparse.Namespace) -> int:
     is_drone = args.source.startswith("tello://")
     if args.fly and not is_drone:
         raise ConfigError(f"{args.source}: --fly is for a drone (tello://HOST)")
-    if (args.max_frames is not None and args.max_frames < 1) or (args.duration is not None and args.duration <= 0):
-        raise ConfigError("--max-frames and --duration must be positive")
     with Progress("waits for the drone" if is_drone else "waits for the camera") as progress, Signals() as signals:
         try:
             if is_drone:

@@ -1,6 +1,7 @@
 """Options that several commands have, their types, and how commands speak."""
 
 import argparse
+import math
 import sys
 from pathlib import Path
 
@@ -58,6 +59,17 @@ def whole_number(text: str, least: int = 0) -> int:
 def positive_number(text: str) -> int:
     """Argument type for counts of at least one."""
     return whole_number(text, 1)
+
+
+def positive_amount(text: str) -> float:
+    """Argument type for times and sizes."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a positive number, got {text[:40]!r}")
+    return value
 
 
 def say(text: str) -> None:

@@ -35,8 +35,8 @@ def test_table_is_printed_written_and_compared(data, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     "arguments",
-    ["data --only desk*", "data --against nowhere", "data --thresholds nowhere.toml", "data --first-seed -1",
-     "data --release 0.3.json", "data --release 0.3.json --only stairs", "data --set base", "data --jobs 0", ""],
+    ["data --only desk*", "data --against nowhere", "data --thresholds nowhere.toml",
+     "data --release 0.3.json", "data --release 0.3.json --only stairs", "data --set base", ""],
 )  # fmt: skip
 def test_mistakes_are_one_line(data, tmp_path, capsys, monkeypatch, arguments):
     monkeypatch.delenv("EDGESLAM_DATA", raising=False)

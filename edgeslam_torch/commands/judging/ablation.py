@@ -23,7 +23,7 @@ def main(args: argparse.Namespace) -> int:
     data = recordings(args.data)
     if data is None:
         raise SourceError("no recordings: give --data or set EDGESLAM_DATA")
-    seeds = tuple(range(max(1, args.seeds)))
+    seeds = tuple(range(args.seeds))
     settings = BenchSettings(data, seeds, tuple(args.sequence), args.max_frames, overrides=tuple(args.set), min_hz=0.0)
     out = args.out or Path("runs") / time.strftime("ablation-%Y%m%d-%H%M%S")
     record = run_ablation(settings, args.row, out, say)

@@ -10,6 +10,7 @@ from edgeslam_torch.commands.judging._common import add_runs_to, recordings, say
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.output_file import output_file
+from edgeslam_torch.help.options import positive_number, whole_number
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="what they fly: goto (default), home, corridor or exits; may be repeated",
     )
-    parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="of those flights (default: 0)")
+    parser.add_argument("--first-seed", type=whole_number, default=0, metavar="N", help="of those flights (default: 0)")
     parser.add_argument(
         "--perception",
         choices=("truth", "slam", "udp"),
@@ -53,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="source of the planner's states: true pose and depth (default), the SLAM, or the SLAM over UDP in real "
         "time",
     )
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="of those flights at a time (default: 1)")
+    parser.add_argument("--jobs", type=positive_number, default=1, metavar="N", help="flights at a time (default: 1)")
     parser.add_argument("--json", type=output_file, metavar="FILE", help="also write the results here")
     parser.add_argument(
         "--compare", nargs=2, type=Path, metavar=("A", "B"), help="only compare two results, A before B"
@@ -78,7 +79,7 @@ def main(args: argparse.Namespace) -> int:
         args.sequence += fetched
     settings = benchmark.BenchSettings(
         data=data,
-        seeds=tuple(range(max(1, args.seeds))),
+        seeds=tuple(range(args.seeds)),
         only=tuple(args.sequence),
         max_frames=args.max_frames,
         mode=args.mode,
@@ -127,8 +128,6 @@ def _navigation(args: argparse.Namespace) -> int:
     for name, known, what in given:
         for wrong in (n for n in name if n not in known):
             raise ConfigError(f"{what}: unknown name {wrong!r}; there are {', '.join(known)}")
-    if args.jobs < 1 or args.seeds < 1 or args.first_seed < 0:
-        raise ConfigError("--jobs and --seeds must be at least 1, --first-seed at least 0")
     out = args.out or Path("runs") / time.strftime("navigation-%Y%m%d-%H%M%S")
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     cases = [

@@ -8,7 +8,7 @@ from edgeslam_torch.commands.judging._common import recordings, say
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.output_file import add_overwrite_to, check_new, check_not_read
-from edgeslam_torch.help.options import add_set
+from edgeslam_torch.help.options import add_set, positive_amount, positive_number, whole_number
 
 CELLS = ("base", "variants", "flights", "telemetry", "imu", "all")
 
@@ -27,11 +27,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="base",
         help="recordings as they are, their variants, simulations, simulated telemetry or IMU, or all (default: base)",
     )
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of every cell (default: 1)")
-    parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="of those runs (default: 0)")
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes at a time (default: 2)")
-    parser.add_argument("--timeout", type=float, default=900.0, metavar="S", help="longest cell [s] (default: 900)")
-    parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
+    parser.add_argument("--seeds", type=positive_number, default=1, metavar="N", help="runs of every cell (default: 1)")
+    parser.add_argument("--first-seed", type=whole_number, default=0, metavar="N", help="of those runs (default: 0)")
+    parser.add_argument("--jobs", type=positive_number, default=2, metavar="N", help="processes at a time (default: 2)")
+    parser.add_argument(
+        "--timeout", type=positive_amount, default=900.0, metavar="S", help="of one cell (default: 900)"
+    )
+    parser.add_argument("--max-frames", type=positive_number, metavar="N", help="stop every run after N frames")
     add_set(parser)
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="results; finished cells are not repeated"
@@ -63,8 +65,6 @@ def main(args: argparse.Namespace) -> int:
     data = recordings(args.data)
     thresholds = read_thresholds(args.thresholds or THRESHOLDS)
     before = read_record(args.against / RECORD, "judge", (FORMAT,), "rows") if args.against is not None else None
-    if args.jobs < 1 or args.seeds < 1 or args.first_seed < 0:
-        raise ConfigError("--jobs and --seeds must be at least 1, --first-seed at least 0")
     if args.release is not None and (args.only or args.set or args.max_frames):
         raise ConfigError("--release runs its own cells with default settings: omit --only, --set and --max-frames")
     if args.release is not None:
