@@ -1,5 +1,6 @@
 """Client for a DJI Tello over its text SDK (1.3 and 2.0): commands, state, video, and safe landing."""
 
+import contextlib
 import logging
 import math
 import os
@@ -8,14 +9,13 @@ import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 
 from edgeslam_torch.drone.address import TelloAddress
 from edgeslam_torch.drone.answers import NoAnswer, TelloError, belongs_to, is_refusal
 from edgeslam_torch.drone.guard import Guard
 from edgeslam_torch.drone.sdk_state import parse_state, sample_from_sdk
 from edgeslam_torch.drone.sticks import Sticks
-from edgeslam_torch.drone.udp import Inlet
+from edgeslam_torch.drone.udp import Inlet, told
 from edgeslam_torch.drone.video_stream import ArrivalClock, Picture, VideoReceiver
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.types import TelemetrySample
@@ -118,7 +118,8 @@ class Tello:
         self._on_state, self._on_picture = on_state, on_picture
         self._replies: queue.Queue[str] = queue.Queue()
         self._sending = threading.RLock()
-        self._airborne = False
+        self.airborne = False
+        """Whether this client has taken off and not landed."""
         self._landing = threading.Event()
         """Set while landing: no other command is sent or waited for."""
         self._leaving = threading.Event()
@@ -173,9 +174,7 @@ class Tello:
     def __enter__(self) -> "Tello":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *unused: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -198,7 +197,12 @@ class Tello:
         self._leaving.wait()
         failure = ""
         try:
-            self._finish_flight()
+            with self._sending:
+                airborne = self.airborne
+            if airborne:
+                self.land()
+            elif self._video is not None:
+                self.send("streamoff", retries=0, timeout_s=0.5)
         except TelloError as error:
             failure = str(error)
         finally:
@@ -208,14 +212,6 @@ class Tello:
                     logger.warning("while closing: %s", failure)
             finally:
                 self._closed.set()
-
-    def _finish_flight(self) -> None:
-        with self._sending:
-            airborne = self._airborne
-        if airborne:
-            self.land()
-        elif self._video is not None:
-            self.send("streamoff", retries=0, timeout_s=0.5)
 
     def _hang_up(self) -> None:
         """End the threads and release the ports; a guard that may still be needed continues alone."""
@@ -298,8 +294,7 @@ class Tello:
             TelloError: If motion is not allowed, the battery is low, the drone refuses, or it does not answer.
         """
         self._check_motion("takeoff")
-        reason = self._unfit()
-        if reason:
+        if reason := self._unfit():
             raise TelloError(f"{self.address.host}: not taking off: {reason}")
         with self._sending:
             self._begin_flight()
@@ -361,10 +356,8 @@ class Tello:
         Raises:
             TelloError: If motion is not allowed.
         """
-        sticks = [
-            round(100 * max(-1.0, min(1.0, s if math.isfinite(s) else 0.0))) for s in (right, forward, up, clockwise)
-        ]
-        self.send("rc " + " ".join(str(s) for s in sticks))
+        sticks = (max(-1.0, min(1.0, s)) if math.isfinite(s) else 0.0 for s in (right, forward, up, clockwise))
+        self.send("rc " + " ".join(f"{round(100 * s)}" for s in sticks))
 
     def move(self, forward_m: float, left_m: float, up_m: float, speed_m_s: float = 0.4) -> None:
         """Fly by a vector in body axes and wait until it is done.
@@ -372,8 +365,7 @@ class Tello:
         Raises:
             TelloError: As `send`.
         """
-        cm = [round(100 * x) for x in (forward_m, left_m, up_m)]
-        self.send(f"go {cm[0]} {cm[1]} {cm[2]} {round(100 * speed_m_s)}")
+        self.send("go " + " ".join(f"{round(100 * x)}" for x in (forward_m, left_m, up_m, speed_m_s)))
 
     def turn(self, left_rad: float) -> None:
         """Turn on the spot, counter-clockwise positive, and wait until it is done.
@@ -398,11 +390,6 @@ class Tello:
         self.send("streamon")
         self._video_begin_s = self.clock.now()
         return self._video
-
-    @property
-    def airborne(self) -> bool:
-        """Whether this client has taken off and not landed."""
-        return self._airborne
 
     @property
     def refused(self) -> dict[str, int]:
@@ -432,17 +419,16 @@ class Tello:
                 self._guard = Guard(self._commands.socket, (self._host, self.address.command_port))
             except OSError as error:
                 logger.warning("no guard against the death of this program (%s); the drone then lands by itself", error)
-        self._airborne = True
+        self.airborne = True
 
     def _end_flight(self) -> None:
-        self._airborne = False
+        self.airborne = False
         guard, self._guard = self._guard, None
         if guard is not None:
             guard.dismiss(landed=True)
 
     def _beat(self, pushed: bool) -> None:
-        guard = self._guard
-        if guard is not None:
+        if (guard := self._guard) is not None:
             guard.beat(pushed)
 
     def _transmit(self, command: str) -> None:
@@ -453,11 +439,9 @@ class Tello:
         self._last_sent_s = self.clock.now()
 
     def _drop_old_replies(self) -> None:
-        while True:
-            try:
+        with contextlib.suppress(queue.Empty):
+            while True:
                 self._replies.get_nowait()
-            except queue.Empty:
-                return
 
     def _answer(self, command: str, timeout_s: float, enough: Callable[[], bool] = lambda: False) -> str | None:
         """The answer to a command; None on timeout, on a requested landing, or when its effect is observed."""
@@ -511,18 +495,8 @@ class Tello:
             self.silences += self.latest is not None and stamp - self.latest.stamp_s > _QUIET_S
             message = StateMessage(stamp, packet.decode("ascii", errors="replace").strip(), fields)
             self.latest = message
-            self._rose |= self._airborne and self._risen()
-            if self._on_state is not None:
-                self._tell(message)
-
-    def _tell(self, message: StateMessage) -> None:
-        """A failing listener must not interrupt state messages in flight."""
-        assert self._on_state is not None
-        try:
-            self._on_state(message)
-        except Exception:
-            logger.exception("the listener for state messages failed and is not called again")
-            self._on_state = None
+            self._rose |= self.airborne and self._risen()
+            self._on_state = told(self._on_state, message)
 
     def _fresh(self) -> dict[str, float | str]:
         """Fields of the last state message; none when it is old."""
@@ -569,26 +543,22 @@ class Tello:
         while not self._stopping.wait(0.1):
             now = self.clock.now()
             reason = self.stop_reason or self._why_land(now)
-            if self._airborne and reason and not self._leaving.is_set():
+            if self.airborne and reason and not self._leaving.is_set():
                 self.stop_reason = reason
                 self._land_because(reason)
             elif missing := self._missing(now):
-                if now - self._last_asked_s > _ASK_S:
-                    self._ask(missing)
+                # Entering SDK mode and asking for video again is harmless for a drone in flight.
+                if now - self._last_asked_s > _ASK_S and self._sent_in_passing(missing, _ASK_ANSWER_S):
+                    self._last_asked_s = now
             elif now - self._last_sent_s > self.limits.keep_alive_s and math.isfinite(self._last_sent_s):
-                self._keep_alive()
+                self._sent_in_passing(["battery?"], 1.0)
 
     def _land_because(self, reason: str) -> None:
-        failure = ""
         try:
-            self.land()
-        except TelloError as error:
-            failure = str(error)
-        # Logged afterwards: a stopped terminal would delay the landing.
-        if failure:
-            logger.error("%s", failure)
-        else:
+            self.land()  # logged afterwards: a stopped terminal would delay it
             logger.warning("%s: landed: %s", self.address.host, reason)
+        except TelloError as error:
+            logger.error("%s", error)
 
     def _why_land(self, now: float) -> str:
         state_s = self.latest.stamp_s if self.latest is not None else self._flight_begin_s
@@ -612,25 +582,15 @@ class Tello:
         words = ["command"] if now - self.latest.stamp_s > _QUIET_S else []
         return [*words, "streamon"] if now - self._pictured_s() > _QUIET_S else words
 
-    def _ask(self, missing: list[str]) -> None:
-        """Enter SDK mode and request video again; harmless for a drone in flight."""
+    def _sent_in_passing(self, commands: list[str], timeout_s: float) -> bool:
+        """Send commands whose answers do not matter, unless another thread is talking to the drone anyway."""
         if not self._sending.acquire(blocking=False):
-            return
+            return False
         try:
-            self._last_asked_s = self.clock.now()
-            for command in missing:
-                self.send(command, timeout_s=_ASK_ANSWER_S, retries=0)
+            for command in commands:
+                self.send(command, timeout_s=timeout_s, retries=0)
         except TelloError:
             logger.debug("%s: no answer yet", self.address.host)
         finally:
             self._sending.release()
-
-    def _keep_alive(self) -> None:
-        if not self._sending.acquire(blocking=False):
-            return  # another thread is talking to the drone anyway
-        try:
-            self.send("battery?", timeout_s=1.0, retries=0)
-        except TelloError:
-            logger.debug("keep-alive was not answered")
-        finally:
-            self._sending.release()
+        return True

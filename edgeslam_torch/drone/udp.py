@@ -3,12 +3,14 @@
 import logging
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import TypeVar
 
 from edgeslam_torch.errors import SourceError
 
 logger = logging.getLogger(__name__)
 
+T = TypeVar("T")
 _POLL_S = 0.2
 _MAX_PACKET = 65536
 
@@ -53,15 +55,11 @@ class Inlet:
                 continue
             if sender[0] == self.host:
                 yield packet
-            else:
-                self._refuse(sender[0])
-
-    def _refuse(self, sender: str) -> None:
-        self.refused += 1
-        if self.refused == 1:
-            logger.warning(
-                "%s port: packets from %s are refused; only %s is listened to", self.purpose, sender, self.host
-            )
+                continue
+            self.refused += 1
+            if self.refused == 1:
+                text = "%s port: packets from %s are refused; only %s is listened to"
+                logger.warning(text, self.purpose, sender[0], self.host)
 
     def stop(self) -> None:
         """End `packets`."""
@@ -89,3 +87,14 @@ def open_udp(address: tuple[str, int], purpose: str) -> socket.socket:
             f"{purpose} port {address[1]} on {address[0]}: {reason}; is another client running?"
         ) from error
     return udp
+
+
+def told(listener: Callable[[T], None] | None, news: T) -> Callable[[T], None] | None:
+    """Tell a listener; one that fails must not interrupt a flight and is None from then on."""
+    try:
+        if listener is not None:
+            listener(news)
+        return listener
+    except Exception:
+        logger.exception("the listener for %s failed and is not called again", type(news).__name__)
+        return None

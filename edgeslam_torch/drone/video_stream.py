@@ -1,7 +1,6 @@
 """A Tello's H.264 stream: datagrams in, the newest decoded picture with its arrival time out."""
 
 import importlib
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -10,11 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from edgeslam_torch.drone.udp import Inlet
+from edgeslam_torch.drone.udp import Inlet, told
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.extras import needs_extra
-
-logger = logging.getLogger(__name__)
 
 CHUNK = 1460
 """Bytes of a full datagram; a shorter one ends a picture."""
@@ -104,18 +101,13 @@ class PictureAssembler:
         av = import_av()
         self._av = av
         self._errors: tuple[type[BaseException], ...] = (av.error.FFmpegError, ValueError)
-        self._context = self._new_context()
+        self._context = av.CodecContext.create("h264", "r")
+        self._context.thread_count = 1  # frame threads would delay pictures
+        self._context.options = {"flags": "low_delay"}
         self._buffer = bytearray()
-        self._first_s = 0.0
         self.decoded = 0
         self.undecodable = 0
         """Pictures lost to missing datagrams or before the first keyframe."""
-
-    def _new_context(self) -> Any:
-        context = self._av.CodecContext.create("h264", "r")
-        context.thread_count = 1  # frame threads would delay pictures
-        context.options = {"flags": "low_delay"}
-        return context
 
     def feed(self, datagram: bytes, stamp_s: float) -> list[Picture]:
         """Pictures completed by one datagram; usually none or one."""
@@ -125,13 +117,10 @@ class PictureAssembler:
         data, self._buffer = bytes(self._buffer), bytearray()
         try:
             frames = self._context.decode(self._av.Packet(data))
-            whole = [frame for frame in frames if not frame.is_corrupt]
-            images = [np.asarray(frame.to_ndarray(format="bgr24")) for frame in whole]
+            images = [np.asarray(frame.to_ndarray(format="bgr24")) for frame in frames if not frame.is_corrupt]
         except self._errors:
-            self.undecodable += 1
-            return []
-        if not images:
-            self.undecodable += 1
+            images = []
+        self.undecodable += not images
         pictures = []
         for image in images:
             self.decoded += 1
@@ -164,20 +153,16 @@ class VideoReceiver:
         self._clock, self._on_picture = clock, on_picture
         self._inlet = Inlet(bind, "video", host, _RECEIVE_BUFFER)
         self._ready = threading.Condition()
-        self._newest: Picture | None = None
+        self.newest: Picture | None = None
+        """The last whole picture; None before the first."""
         self._stopping = False
         self._thread = threading.Thread(target=self._work, name="tello-video", daemon=True)
         self._thread.start()
 
     @property
-    def newest(self) -> Picture | None:
-        """The last whole picture; None before the first."""
-        return self._newest
-
-    @property
-    def statistics(self) -> dict[str, int]:
-        """Pictures decoded and undecodable."""
-        return {"decoded": self._assembler.decoded, "undecodable": self._assembler.undecodable}
+    def undecodable(self) -> int:
+        """Pictures lost to missing datagrams or before the first keyframe."""
+        return self._assembler.undecodable
 
     @property
     def refused(self) -> int:
@@ -188,28 +173,18 @@ class VideoReceiver:
         """The newest picture after ``after_count``; None after the timeout."""
         with self._ready:
             self._ready.wait_for(lambda: self._stopping or self._later(after_count), timeout_s)
-            return self._newest if self._later(after_count) else None
+            return self.newest if self._later(after_count) else None
 
     def _later(self, count: int) -> bool:
-        return self._newest is not None and self._newest.count > count
+        return self.newest is not None and self.newest.count > count
 
     def _work(self) -> None:
         for datagram in self._inlet.packets():
             for picture in self._assembler.feed(datagram, self._clock.now()):
                 with self._ready:
-                    self._newest = picture
+                    self.newest = picture
                     self._ready.notify_all()
-                if self._on_picture is not None:
-                    self._tell(picture)
-
-    def _tell(self, picture: Picture) -> None:
-        """A failing listener must not interrupt video in flight."""
-        assert self._on_picture is not None
-        try:
-            self._on_picture(picture)
-        except Exception:
-            logger.exception("the listener for pictures failed and is not called again")
-            self._on_picture = None
+                self._on_picture = told(self._on_picture, picture)
 
     def stop(self) -> None:
         """Close the socket and end the thread."""

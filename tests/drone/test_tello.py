@@ -298,9 +298,8 @@ def test_listeners_that_fail_do_not_end_state_or_video(caplog):
 
 @pytest.mark.parametrize(
     ("command", "text", "belongs"),
-    [("battery?", "87", True), ("sn?", "0TQDF123", True), ("go 20 0 0 30", "error Not joystick", True),
-     ("battery?", "ok", False), ("land", "87", False), ("takeoff", "x", False), ("sn?", "ok", False),
-     ("land", "ok\x00", False)],
+    [("hardware?", "TELLO", True), ("sn?", "ok", False), ("go 20 0 0 30", "error Not joystick", True),
+     ("takeoff", "x", False), ("land", "ok\x00", False)],
 )  # fmt: skip
 def test_late_answers_and_noise_are_not_taken_for_an_answer(command, text, belongs):
     assert belongs_to(command, text) is belongs
@@ -355,7 +354,7 @@ def test_video_survives_a_start_in_mid_stream_lost_packets_and_garbage(rng):
             shown += assembler.feed(packet, 0.1 * k)
             if rng.random() < 0.02:
                 shown += assembler.feed(rng.bytes(300), 0.1 * k)
-    assert len(shown) > 20
+    assert len(shown) > 20 and assembler.undecodable > 5
     assert all(p.image.shape == (240, 320, 3) for p in shown)
     assert [p.count for p in shown] == sorted({p.count for p in shown})
 

@@ -39,12 +39,11 @@ class Reply:
 class Interpreter:
     """The part of SDK 2.0 for a drone without expansion board."""
 
-    def __init__(self, drone: DroneModel, fly: bool = True) -> None:
+    def __init__(self, drone: DroneModel) -> None:
         self.drone = drone
         self.sdk_mode = False
         self.stream = False
         self.speed_cm_s = 50
-        self._can_fly = fly
 
     def run(self, text: str) -> Reply:
         """Carry out one command line."""
@@ -59,11 +58,11 @@ class Interpreter:
             return Reply("", Answer.NEVER)  # a real drone is silent until it receives "command"
         if name.endswith("?"):
             return self._query(name)
+        numbers = _numbers(words[1:])
         if name == "rc":
-            return self._rc(words[1:])
+            return self._rc(numbers)
         if name in ("takeoff", "throwfly"):
-            taken = self._can_fly and self.drone.take_off()
-            return Reply("ok", Answer.WHEN_DONE) if taken else Reply("error")
+            return Reply("ok", Answer.WHEN_DONE) if self.drone.take_off() else Reply("error")
         if name == "land":
             if not self.drone.flying:
                 return Reply("error")
@@ -76,15 +75,14 @@ class Interpreter:
             self.stream = name == "streamon"
             return Reply("ok")
         if name == "speed":
-            return self._set_speed(words[1:])
+            return self._set_speed(numbers)
         if name in _SETTINGS or name in _PLAIN:
             return Reply("ok" if len(words) > 1 or name in _PLAIN else "error")
-        return self._movement(name, words[1:])
+        return self._movement(name, words[1:], numbers)
 
-    def _movement(self, name: str, arguments: list[str]) -> Reply:
+    def _movement(self, name: str, words: list[str], numbers: list[float] | None) -> Reply:
         drone = self.drone
-        known = name in _DIRECTIONS or name in ("cw", "ccw", "go", "curve", "flip", "stop")
-        if not known:
+        if name not in _DIRECTIONS and name not in ("cw", "ccw", "go", "curve", "flip", "stop"):
             return Reply(f"unknown command: {name}")
         if not drone.flying:
             return Reply("error Not joystick")
@@ -92,8 +90,7 @@ class Interpreter:
             drone.stop()
             return Reply("ok")
         if name == "flip":
-            return Reply("ok" if arguments and arguments[0] in "lrfb" else "error")
-        numbers = _numbers(arguments)
+            return Reply("ok" if words and words[0] in "lrfb" else "error")
         if numbers is None:
             return Reply("error")
         if name in _DIRECTIONS and len(numbers) == 1:
@@ -119,15 +116,13 @@ class Interpreter:
         self.drone.move(0.01 * np.array(cm), 0.01 * speed)  # SDK: x forward, y left, z up
         return Reply("ok", Answer.WHEN_DONE)
 
-    def _rc(self, arguments: list[str]) -> Reply:
-        numbers = _numbers(arguments)
+    def _rc(self, numbers: list[float] | None) -> Reply:
         if numbers is not None and len(numbers) == 4 and max(abs(n) for n in numbers) <= 100:
             right, forward, up, clockwise = (0.01 * n for n in numbers)
             self.drone.rc = (right, forward, up, clockwise)
         return Reply("", Answer.NEVER)
 
-    def _set_speed(self, arguments: list[str]) -> Reply:
-        numbers = _numbers(arguments)
+    def _set_speed(self, numbers: list[float] | None) -> Reply:
         if numbers is None or len(numbers) != 1 or not 10 <= numbers[0] <= 100:
             return Reply("error")
         self.speed_cm_s = int(numbers[0])

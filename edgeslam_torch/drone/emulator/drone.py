@@ -74,6 +74,8 @@ class DroneModel:
     yaw: float = 0.0
     yaw_rate: float = 0.0
     mode: Mode = Mode.GROUND
+    clock_s: float = 0.0
+    """Time since power-on [s]."""
     motor_s: float = 0.0
     """Time with motors on [s]."""
     rc: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
@@ -85,16 +87,10 @@ class DroneModel:
     _target_yaw: float | None = None
     _speed: float = 0.5
     _busy_since: float = -1.0
-    _clock: float = 0.0
     _lowest: tuple[float, float] = (math.inf, 0.0)
     """Height of the present landing [m], and when it was reached."""
     _clear_m: float = math.inf
     """Distance to the nearest surface at the end of the last step; infinite on the ground."""
-
-    @property
-    def clock_s(self) -> float:
-        """Time since power-on [s]."""
-        return self._clock
 
     @property
     def flying(self) -> bool:
@@ -112,7 +108,7 @@ class DroneModel:
             return False
         self.mode = Mode.TAKEOFF
         self._target = np.array([self.p_w[0], self.p_w[1], _GROUND_M + _HOVER_M])
-        self._speed, self._busy_since = 0.5, self._clock
+        self._speed, self._busy_since = 0.5, self.clock_s
         return True
 
     def land(self) -> None:
@@ -120,7 +116,7 @@ class DroneModel:
         if self.flying:
             self.stop()
             if self.mode is not Mode.LANDING:
-                self._lowest = float(self.p_w[2]), self._clock
+                self._lowest = float(self.p_w[2]), self.clock_s
             self.mode = Mode.LANDING
 
     def cut(self) -> None:
@@ -138,15 +134,15 @@ class DroneModel:
         """Fly by ``body_m`` ``(3,)`` forward, left, up, relative to the current heading."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         step = np.array([c * body_m[0] - s * body_m[1], s * body_m[0] + c * body_m[1], body_m[2]])
-        self._target, self._speed, self._busy_since = self.p_w + step, speed_m_s, self._clock
+        self._target, self._speed, self._busy_since = self.p_w + step, speed_m_s, self.clock_s
 
     def turn(self, left_rad: float) -> None:
         """Turn by an angle, counter-clockwise positive; more than half a turn is flown in full."""
-        self._target_yaw, self._busy_since = self.yaw + left_rad, self._clock
+        self._target_yaw, self._busy_since = self.yaw + left_rad, self.clock_s
 
     def step(self, dt: float) -> None:
         """Advance by ``dt`` seconds."""
-        self._clock += dt
+        self.clock_s += dt
         if not self.flying:
             self._clear_m = math.inf
             return
@@ -179,7 +175,7 @@ class DroneModel:
         """Bounce off, or crash; returns where it is afterwards. What it touches may be what moves."""
         speed = max(float(np.linalg.norm(self.velocity)), closing_m_s if math.isfinite(closing_m_s) else 0.0)
         crashed = speed > _CRASH_M_S
-        self.contacts.append(Contact(self._clock, self.p_w.copy(), speed, crashed, self.mode))
+        self.contacts.append(Contact(self.clock_s, self.p_w.copy(), speed, crashed, self.mode))
         if crashed:
             self.cut()
             return self.p_w
@@ -208,7 +204,7 @@ class DroneModel:
         self.yaw += dt * self.yaw_rate
 
     def _finish(self) -> None:
-        late = self._clock - self._busy_since > 20.0  # pressed against a wall
+        late = self.clock_s - self._busy_since > 20.0  # pressed against a wall
         if self._target is not None and (late or float(np.linalg.norm(self._target - self.p_w)) < 0.04):
             self._target = None
             self.mode = Mode.FLYING
@@ -226,9 +222,9 @@ class DroneModel:
         """Whether a landing goes no lower: on furniture."""
         height_m, at_s = self._lowest
         if self.p_w[2] < height_m - _SETTLED_M:
-            self._lowest = float(self.p_w[2]), self._clock
-        touches = bool(self.contacts) and self._clock - self.contacts[-1].clock_s < 0.5 * _SETTLED_S
-        return touches and self._clock - at_s > _SETTLED_S  # else it only has to stop climbing first
+            self._lowest = float(self.p_w[2]), self.clock_s
+        touches = bool(self.contacts) and self.clock_s - self.contacts[-1].clock_s < 0.5 * _SETTLED_S
+        return touches and self.clock_s - at_s > _SETTLED_S  # else it only has to stop climbing first
 
     def _stand(self) -> None:
         self.mode, self.velocity, self.yaw_rate = Mode.GROUND, np.zeros(3), 0.0
@@ -253,7 +249,7 @@ class DroneModel:
         return se3.inverse(self.T_w_b())[:3, :3] @ force
 
 
-def state_line(drone: DroneModel, temperature: int = 60, mission_pads: bool = True) -> str:
+def state_line(drone: DroneModel, mission_pads: bool = True) -> str:
     """State message in the SDK's format, units and axes.
 
     Velocities are truncated to whole decimetres per second, as the recorded flights show.
@@ -265,7 +261,7 @@ def state_line(drone: DroneModel, temperature: int = 60, mission_pads: bool = Tr
     pads = "mid:-1;x:0;y:0;z:0;mpry:0,0,0;" if mission_pads else ""
     return (
         f"{pads}pitch:{round(-rpy[1])};roll:{round(rpy[0])};yaw:{round(-rpy[2])};"
-        f"vgx:{v[0]};vgy:{v[1]};vgz:{v[2]};templ:{temperature - 2};temph:{temperature};"
+        f"vgx:{v[0]};vgy:{v[1]};vgz:{v[2]};templ:58;temph:60;"
         f"tof:{max(10, round(100 * drone.p_w[2]))};h:{10 * round(10 * height)};bat:{math.ceil(100 * drone.battery)};"
         f"baro:{100.0 + height:.2f};time:{int(drone.motor_s)};"
         f"agx:{force[0]:.2f};agy:{force[1]:.2f};agz:{force[2]:.2f};\r\n"

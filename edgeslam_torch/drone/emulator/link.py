@@ -21,8 +21,6 @@ class LinkFaults:
     latency_s: float = 0.003
     video_latency_s: float = 0.3
     """Latency of video; a Tello's is 0.3 to 0.8 s."""
-    outages_s: tuple[tuple[float, float], ...] = ()
-    """Outages, in seconds since the emulator's start."""
     garbage: float = 0.0
     """Share of packets followed by one of random bytes."""
 
@@ -37,7 +35,6 @@ class Link:
     def __init__(self, faults: LinkFaults, seed: int = 0) -> None:
         self.faults = faults
         self._rng = np.random.default_rng(seed)
-        self._begin = time.monotonic()
         self._heap: list[tuple[float, int, socket.socket, bytes, Address]] = []
         self._count = itertools.count()
         self._wake = threading.Condition()
@@ -49,9 +46,7 @@ class Link:
 
     def passes(self) -> bool:
         """Whether a packet is delivered."""
-        now = time.monotonic() - self._begin
-        dark = self.cut or any(a <= now < b for a, b in self.faults.outages_s)
-        return not dark and not (self.faults.loss > 0 and self._rng.random() < self.faults.loss)
+        return not self.cut and not (self.faults.loss > 0 and self._rng.random() < self.faults.loss)
 
     def send(self, sender: socket.socket, packet: bytes, to: Address, latency_s: float) -> None:
         """Queue one packet."""

@@ -1,8 +1,9 @@
 """The emulated Tello on a simulated clock: a flight depends on its seed and its commands, not on the machine's load."""
 
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Literal
 
 import numpy as np
@@ -99,7 +100,7 @@ class LockstepTello:
     _steps: int = 0
     _queue: list[tuple[float, int, object]] = field(default_factory=list)
     """What is on its way, by its time of arrival: commands (str) and events."""
-    _sent: int = 0
+    _number: Iterator[int] = field(default_factory=count)
     _pending: list[str] = field(default_factory=list)
     """Answers that wait for the end of a movement."""
     _last_command_s: float = 0.0
@@ -187,5 +188,4 @@ class LockstepTello:
         return not lost and not cut
 
     def _post(self, at_s: float, item: object) -> None:
-        self._sent += 1
-        heapq.heappush(self._queue, (at_s, self._sent, item))
+        heapq.heappush(self._queue, (at_s, next(self._number), item))

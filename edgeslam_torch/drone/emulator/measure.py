@@ -108,13 +108,13 @@ def _fly(address: TelloAddress, seconds: float) -> Measured:
         if video.wait(0, _START_S) is None:
             raise TelloError(f"{address.host}: no picture in {_START_S:.0f} s")
         tello.take_off()
-        before = (len(shown), len(pictures), len(states), video.statistics["undecodable"])
+        before = (len(shown), len(pictures), len(states), video.undecodable)
         begin = time.monotonic()
         while (flown := time.monotonic() - begin) < seconds and not tello.stop_reason:
             tello.rc(0.1 * np.sin(flown), 0.2 * np.cos(0.7 * flown), 0.0, 0.3)
             video.wait(10**9, min(_STICKS_S, seconds - flown))
         used = slice(before[0], len(shown))
-        counts = (len(pictures) - before[1], len(states) - before[2], video.statistics["undecodable"] - before[3])
+        counts = (len(pictures) - before[1], len(states) - before[2], video.undecodable - before[3])
     moments = [moment for moment, _ in shown[used]]
     fresh = len(dict.fromkeys(moments))
     return Measured(flown, counts[0], fresh, np.array([d for _, d in shown[used]]), counts[1], counts[2])

@@ -62,13 +62,11 @@ class TelloEmulator:
         self.interpreter = Interpreter(self.drone)
         self.frozen = False
         """Stops answering and sending, like crashed firmware; the drone lands without commands."""
-        self.frames_sent = 0
-        self.frames_painted = 0
         self._render = render or _test_card(config.width, config.height)
         self._socket = open_udp((config.bind, config.command_port), "command")
         self._socket.settimeout(0.1)
         self.command_port = int(self._socket.getsockname()[1])
-        self._link = Link(config.link, config.seed)
+        self.link = Link(config.link, config.seed)
         self._lock = threading.Lock()
         self._client: tuple[str, int] | None = None
         self._last_command_s = time.monotonic()
@@ -87,11 +85,6 @@ class TelloEmulator:
             )
         ]
 
-    @property
-    def link(self) -> Link:
-        """The link, to cut it."""
-        return self._link
-
     def start(self) -> "TelloEmulator":
         """Start listening."""
         for thread in self._threads:
@@ -103,7 +96,7 @@ class TelloEmulator:
         self._stopping.set()
         for thread in self._threads:
             thread.join(timeout=2.0)
-        self._link.stop()
+        self.link.stop()
         self._socket.close()
 
     def __enter__(self) -> "TelloEmulator":
@@ -116,13 +109,11 @@ class TelloEmulator:
         while not self._stopping.is_set():
             try:
                 packet, sender = self._socket.recvfrom(2048)
-            except TimeoutError:
-                continue
-            except ConnectionError:
+            except (TimeoutError, ConnectionError):
                 continue
             except OSError:
                 return
-            if self.frozen or not self._link.passes():
+            if self.frozen or not self.link.passes():
                 continue
             text = packet.decode("ascii", errors="replace").strip("\x00 \r\n")
             with self._lock:
@@ -136,7 +127,7 @@ class TelloEmulator:
                 self._answer(sender, reply.text)
 
     def _answer(self, to: tuple[str, int], text: str) -> None:
-        self._link.send(self._socket, text.encode("ascii", errors="replace"), to, self.config.link.latency_s)
+        self.link.send(self._socket, text.encode("ascii", errors="replace"), to, self.config.link.latency_s)
 
     def _fly(self) -> None:
         """Body at 100 Hz, state at 10 Hz, and the landing after 15 s of silence."""
@@ -151,8 +142,7 @@ class TelloEmulator:
                 if self.drone.flying and now - self._last_command_s > _SILENCE_LAND_S:
                     self.drone.land()
                 done = [] if self.drone.busy else self._pending
-                if done:
-                    self._pending = []
+                self._pending = self._pending[len(done) :]
                 client, ready = self._client, self.interpreter.sdk_mode
                 line = state_line(self.drone, mission_pads=self.config.mission_pads)
             if not self.frozen:
@@ -160,7 +150,7 @@ class TelloEmulator:
                     self._answer(to, text)
                 if client is not None and ready and now >= next_state:
                     to = (client[0], self.config.state_port)
-                    self._link.send(self._socket, line.encode("ascii"), to, self.config.link.latency_s)
+                    self.link.send(self._socket, line.encode("ascii"), to, self.config.link.latency_s)
             if now >= next_state:
                 next_state += _STATE_S * max(1, math.ceil((now - next_state) / _STATE_S))
             self._stopping.wait(_STEP_S)
@@ -183,7 +173,6 @@ class TelloEmulator:
             if self.config.stopwatch:
                 draw_time(image, moment_s)
             self._picture = image
-            self.frames_painted += 1
             self._painted.set()
 
     def _stream(self) -> None:
@@ -205,10 +194,9 @@ class TelloEmulator:
             packets = encoder.encode(picture)
             if self.frozen:
                 continue
-            self.frames_sent += 1
             for packet in packets:
                 to = (client[0], self.config.video_port)
-                self._link.send(self._socket, packet, to, self.config.link.video_latency_s)
+                self.link.send(self._socket, packet, to, self.config.link.video_latency_s)
 
 
 def _test_card(width: int, height: int) -> Render:
