@@ -7,7 +7,7 @@ import pytest
 from point_map import CAMERA, SCALE_FACTOR, add_anchors, check_map, edge_points
 
 from edgeslam_torch.atlas import atlas as atlas_module
-from edgeslam_torch.atlas.atlas import Atlas, far_keyframes
+from edgeslam_torch.atlas.atlas import LOOP_SEARCH_RAD, Atlas, far_keyframes
 from edgeslam_torch.atlas.links import link
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.atlas.submap_graph import SubmapGraph
@@ -303,3 +303,17 @@ def test_a_planar_loop_needs_a_scale_from_images(rng, monkeypatch):
     turning, flying = guessed(Ring(rng)), Ring(rng)
     assert closed(turning, turning.atlas()) == []
     assert len(closed(flying, flying.atlas())) == 1
+
+
+@pytest.mark.parametrize(("turn", "asked"), [(1.1 * LOOP_SEARCH_RAD, 4), (0.3 * LOOP_SEARCH_RAD, 2)])
+def test_loops_are_searched_more_often_during_rotation(rng, monkeypatch, turn, asked):
+    """Four keyframes within a second, at the last of which a second has passed."""
+    ring, looks = Ring(rng), []
+    atlas = ring.atlas()
+    monkeypatch.setattr(atlas_module, "far_keyframes", lambda _, keyframe: looks.append(keyframe.id) or [])
+    first = ring.keyframes[0]
+    for k in range(4):
+        c, s = np.cos(k * turn), np.sin(k * turn)
+        R = np.array([[c, 0.0, -s, 0.0], [0.0, 1.0, 0.0, 0.0], [s, 0.0, c, 0.0], [0.0, 0.0, 0.0, 1.0]])
+        atlas._loop_candidates(replace(first, stamp_s=k / 3.0, T_c_w=R @ first.T_c_w))
+    assert len(looks) == asked

@@ -190,3 +190,15 @@ def test_a_late_video_is_taken_into_account(rng):
     unsure = replace(early, delay_sigma_s=0.2).positions(stamps, p)
     assert chi2(unsure, p) < 0.3 * chi2(wrong, p)
     assert TelemetryFaults().video_delay_s == 0.5
+
+
+@pytest.mark.parametrize(("way_s", "least_m", "most_m"), [(0.5, 0.0145, 0.02), (8.0, 0.15, 0.2)])
+def test_a_drone_whose_reading_stays_the_same_does_not_fly_evenly(way_s, least_m, most_m):
+    """Half a second errs by the rounding as it is, .0145 m; eight would by .23, were it the same all the while."""
+    samples = [
+        TelemetrySample(t, np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.0, 1e-3 * t])) for t in np.arange(0.0, 12.0, 0.1)
+    ]
+    stamps = np.array([1.0, 1.0 + way_s])
+    p = np.array([[0.0, 0.0, 0.0], [0.3 * way_s, 0.0, 0.0]])
+    told = model_of(samples, scale_sigma_log=1e-6).positions(stamps, p)
+    assert least_m < told.information[3, 3] ** -0.5 < most_m

@@ -9,6 +9,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.rotations import (
     euler_rate_matrix,
     matrix_from_rpy,
+    mean_rotation,
     rotation_vector,
     wrapped,
 )
@@ -29,6 +30,12 @@ def test_euler_rates_match_a_numeric_derivative(rng):
         moved = rpy + step * np.eye(3)[k]
         turn = rotation_vector(matrix_from_rpy(moved) @ matrix_from_rpy(rpy).T) / step
         np.testing.assert_allclose(euler_rate_matrix(rpy)[:, k], turn, atol=1e-5)
+
+
+def test_mean_of_rotations_around_one_is_that_one(rng):
+    R = matrix_from_rpy(np.array([0.1, -0.4, 2.0]))
+    around = np.array([R @ se3.exp(np.r_[0, 0, 0, v])[:3, :3] for v in rng.normal(0, 0.05, (400, 3))])
+    assert np.linalg.norm(rotation_vector(mean_rotation(around).T @ R)) < 0.01
 
 
 def test_literal_process_noise_is_paper_equation_10_by_hand():

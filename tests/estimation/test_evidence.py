@@ -1,6 +1,7 @@
 import math
 
 import numpy as np
+import pytest
 
 from edgeslam_torch.estimation.scale.evidence import (
     aged_since,
@@ -134,6 +135,21 @@ def test_height_gives_the_scale_of_a_tilted_map(rng):
 # -- a map that drifts in scale ------------------------------------------------------------------------------------
 
 
+def test_a_noisy_map_does_not_shrink_the_scale_from_height(rng):
+    """A climb of 12 cm to and fro, seen with 5 cm of noise: as a regressor it would shrink the scale by 8 %."""
+
+    def noisy():
+        t, p, z = flown(rng, 600)
+        p[:, 2] *= 0.5
+        z = 1.0 + SCALE * p[:, 2] + 0.012 * rng.standard_normal(len(z))
+        seen = p + 0.05 / SCALE * rng.standard_normal(p.shape)
+        segment = np.zeros(len(t), dtype=np.int64)
+        return [height_evidence(seen, DOWN[: len(t)], z, t, segment, 0.05 / SCALE, 0.015, SCALE, TILT)]
+
+    error, _ = errors(noisy, 40)
+    assert abs(np.mean(error)) < 0.03
+
+
 def climbed_then_level(rng, drift):
     """Climb for two seconds, then level flight for ten; the map's first two seconds are ``drift`` shorter."""
     t = 0.5 * np.arange(25)
@@ -141,6 +157,14 @@ def climbed_then_level(rng, drift):
     seen = step * np.where(t < 2.0, math.exp(-drift), 1.0)[:, None] / SCALE
     told = step + 0.0094 * rng.standard_normal(step.shape)
     return t, seen, told
+
+
+def climbed(rng, drift):
+    """Heights of the same flight at 10 Hz."""
+    t = 0.1 * np.arange(120)
+    z = 0.5 * np.minimum(t, 2.0)
+    p = np.stack([0.4 * np.maximum(t - 2.0, 0.0), 0.0 * t, z * math.exp(-drift)], axis=1) / SCALE
+    return t, p, z + 0.012 * rng.standard_normal(120)
 
 
 def test_the_present_scale_follows_a_map_that_has_drifted_since_the_climb(rng):
@@ -155,3 +179,17 @@ def test_the_present_scale_follows_a_map_that_has_drifted_since_the_climb(rng):
     now, all_along = np.array(present), np.array(throughout)
     assert abs(now[:, 0].mean()) < 0.7 * all_along[:, 0].mean()
     assert np.sqrt(np.mean((now[:, 0] / now[:, 1]) ** 2)) < 1.5
+
+
+def test_heights_of_an_old_climb_are_less_sure_of_the_present_scale(rng):
+    """A climb ten seconds ago of a map that is 10 % off there: covered, the surer the younger the climb."""
+    t, p, z = climbed(rng, 0.1)
+    segment = np.zeros(len(t), int)
+    sigmas = []
+    for until, aged in ((40, True), (120, True), (120, False)):
+        given = (p[:until], DOWN[:until], z[:until], t[:until], segment[:until], 1e-4, 0.015, SCALE, TILT)
+        s, sigma = height_evidence(*given, aged_since(t[:until], 0.0, t[until - 1]) if aged else None).solved(TILT)
+        sigmas.append(sigma)
+        assert s == pytest.approx(SCALE * math.exp(0.1), rel=0.03)
+    assert sigmas[0] < 0.8 * sigmas[1]
+    assert sigmas[2] < 0.8 * sigmas[1]

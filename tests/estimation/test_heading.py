@@ -11,7 +11,7 @@ from swung import T_B_C, swinging
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
-from edgeslam_torch.noise import HEADING_DRIFT_RAD_S, HEADING_RAD
+from edgeslam_torch.noise import HEADING_DRIFT_RAD_S, HEADING_RAD, TURN_SHARE
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
 
 
@@ -52,6 +52,17 @@ def test_a_common_turn_costs_nothing_and_one_keyframe_alone_its_sigma(rng):
     drift = HEADING_DRIFT_RAD_S * (stamps_s - stamps_s[0])
     assert chi2(told, step) > 10.0
     assert chi2(told, drift) < 1.1
+
+
+def test_half_a_percent_of_each_turn_costs_little(rng):
+    """As a focal length that is half a percent off turns a camera, and not by twice as much one way as the other."""
+    motion = swinging(14.0)
+    stamps_s = flown(rng, motion)[2]
+    yaw = 20.0 * 0.3 * np.sin(0.7 * stamps_s)  # twenty times what is swung: whole turns
+    wide = replace(motion, T_w_c=turned(motion, 20.0))
+    told = flown(rng, wide)[0]
+    assert chi2(told, TURN_SHARE * yaw) < 1.5
+    assert chi2(told, TURN_SHARE * np.abs(yaw)) > 10.0
 
 
 def turned(motion, share):

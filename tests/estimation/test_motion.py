@@ -79,16 +79,6 @@ def test_a_swung_camera_in_flight(fused):
     assert told.get("ekf visual refused", 0) < 0.1 * told["ekf visual accepted"], "95 % pass"
 
 
-def test_nothing_is_known_before_motion_or_telemetry():
-    motion = swinging(2.0)
-    fusion = MotionFusion(FusionConfig(), T_B_C)
-    assert fusion.predict(0.0) is None
-    for t, T in zip(motion.stamps_s, motion.T_w_c, strict=True):
-        fusion.add_visual(float(t), T, 0.003, 0.002)
-    assert fusion.scale().units is Units.ARBITRARY
-    assert fusion.orientation.R_w_m is None
-
-
 def test_gravity_is_there_with_the_first_frame(rng):
     motion = swinging(3.0)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()
@@ -140,6 +130,20 @@ def test_height_changes_alone_tell_the_scale_of_a_climb(fused):
     fusion, gauge = fused(on_the_spot(swinging(1.0), t, 1.0 + 0.5 * np.sin(0.6 * t), 0.0 * t))
     assert "height" in fusion.scale().source
     assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.04)
+
+
+def test_pure_rotation_discards_the_scale_of_a_climb(fused):
+    """A quarter of a metre up in seven seconds, of which velocities tell nothing; then round on the spot: the map in
+    view shares nothing any more with what the climb told. A drone that glances to the side keeps them."""
+    t, told = np.arange(0.0, 14.0, 0.1), {}
+    risen = np.clip(t / 7.0, 0, 1)
+    for turned_rad in (0.0, 0.5, 1.5, 3.0):
+        yaw = 0.2 * np.sin(t) + turned_rad * np.clip((t - 7.0) / 5.0, 0, 1)
+        motion = on_the_spot(swinging(1.0), t, 0.4 + 0.25 * risen**2 * (3 - 2 * risen), yaw)
+        told[turned_rad] = fused(motion, AT_ONCE, network=1.5, seed=0)[0].metres.sensor_scale
+    assert told[0.0].source == "height" and told[0.0].sigma < 0.13
+    assert told[0.5].sigma < 1.1 * told[0.0].sigma < told[1.5].sigma < told[3.0].sigma
+    assert told[3.0].sigma > 0.2, "two views beyond the overlap, each of a unit that is .15 another"
 
 
 def test_small_height_changes_give_no_scale(fused):

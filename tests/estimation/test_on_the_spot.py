@@ -1,7 +1,6 @@
 """Flights that tell little of metres: what is stated of them holds."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -83,14 +82,3 @@ def test_positions_that_err_with_the_rotation_do_not_pull_the_scale():
         off.append(math.log(scale.value) * scale.value / scale.sigma)
     assert np.abs(off).max() < 2.5
     assert np.sqrt(np.mean(np.square(off))) < 1.4
-
-
-def test_velocities_in_another_unit_than_the_heights_are_not_explained_by_truncation():
-    """Half of each velocity is nearly what truncation would leave of it, and heights would decide for that."""
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        T_w_c = turning(rng, size_m=0.18)
-        T_m_c = mapped(rng, T_w_c, EVEN)
-        half = in_the_end(T_w_c, T_m_c, rng, lambda s: replace(s, velocity_m_s=0.5 * s.velocity_m_s))
-        assert half.metres.sensor_scale is None
-        assert any("contradict each other" in said for said in half.warnings())

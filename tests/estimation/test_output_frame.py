@@ -25,32 +25,25 @@ def test_after_a_revision_the_way_back_to_the_start_is_right(rng):
 
 
 @pytest.mark.parametrize(
-    ("value", "sigma", "source"),
+    ("value", "sigma", "source", "published_sigma", "revised"),
     [
-        (3.0, 0.1, "depth"),  # the network guessed already, and has nothing new to say
-        (3.0, 1.4, "telemetry"),  # hardly known, and within that
-        (2.02, 0.05, "height+depth"),  # within its own uncertainty
-        (1.0, np.inf, "none"),
+        (1.5, 0.05, "depth", np.inf, False),  # the network guessed already, and has nothing new to say
+        (1.5, 0.7, "telemetry", np.inf, False),  # hardly known, and within that
+        (1.01, 0.025, "height+depth", np.inf, False),  # within its own uncertainty
+        (0.5, np.inf, "none", np.inf, False),
+        (1.1, 0.08, "height+depth", np.inf, True),  # more than a sigma off an initial guess: probably nearer
+        (1.1, 0.109, "height+depth", np.inf, False),  # not surer than it is off
+        (1.1, 0.08, "height+depth", 0.17, True),
+        (1.1, 0.08, "height+depth", 0.14, False),  # hardly better than what was measured before
+        (1.1, 0.04, "height+depth", 0.05, True),  # contradicts it
     ],
 )
-def test_unmeasured_uncertain_or_consistent_scales_do_not_revise(value, sigma, source):
-    old = OutputFrame(2.0)
-    assert old.revised(ScaleEstimate(value, sigma, source)) is old
-
-
-@pytest.mark.parametrize(
-    ("value", "sigma", "published_sigma", "given_up"),
-    [
-        (1.1, 0.08, np.inf, True),  # more than a sigma off an initial guess: what is measured is likely to be nearer
-        (1.1, 0.109, np.inf, False),  # not surer than it is off
-        (1.1, 0.08, 0.17, True),
-        (1.1, 0.08, 0.14, False),  # hardly better than what was measured before
-        (1.1, 0.04, 0.05, True),  # contradicts it
-    ],
-)
-def test_a_scale_is_revised_by_a_much_better_or_a_contradicting_one(value, sigma, published_sigma, given_up):
-    old = OutputFrame(1.0, revision=1, sigma=published_sigma)
-    assert old.revised(ScaleEstimate(value, sigma, "height+depth")).revision == 1 + given_up
+@pytest.mark.parametrize("unit", [1.0, 2.0])
+def test_a_scale_is_revised_by_a_much_better_or_a_contradicting_one(
+    value, sigma, source, published_sigma, revised, unit
+):
+    old = OutputFrame(unit, revision=1, sigma=published_sigma)
+    assert old.revised(ScaleEstimate(unit * value, unit * sigma, source)).revision == 1 + revised
 
 
 def test_a_map_is_turned_upright_once(rng):

@@ -92,6 +92,16 @@ def test_a_verdict_is_kept_until_contradicted_and_velocities_rest_on_attitude():
 # --- flights -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("correlation", [0.3, -0.3])
+def test_few_height_changes_count_beside_validated_velocities_unless_they_go_the_other_way(correlation):
+    trust = SensorGate()
+    trust.judge(Reading.VELOCITY, Agreement(0.95, 20))
+    assert trust.height(Reading.BARO), "before any comparison"
+    trust.judge(Reading.BARO, Agreement(correlation, 6, dimensions=1))
+    assert trust.verdict(Reading.BARO) is Verdict.OPEN
+    assert trust.height(Reading.BARO) == (correlation > 0.0)
+
+
 def smooth(rng, count, size):
     """Velocities of another flight: as slow as a drone's, with no relation to this one."""
     kernel = np.exp(-0.5 * (np.arange(-20, 21) / 6.0) ** 2)
@@ -228,6 +238,25 @@ def sideways_late(from_s, end_s):
     T, later = motion.T_w_c.copy(), np.maximum(motion.stamps_s - from_s, 0.0)
     T[:, 1, 3] = 0.3 * np.sin(1.5 * later)
     return replace(motion, T_w_c=T)
+
+
+def test_motion_along_one_axis_proves_nothing_of_another(told_of):
+    """Velocities that agree so far do not pull the map along an axis that has not moved yet."""
+    motion = sideways_late(8.0, 9.0)
+    seen = replace(motion, stamps_s=motion.stamps_s[:166], T_w_c=motion.T_w_c[:166])
+
+    def feed(fusion, motion, gauge, samples):
+        fusion.add_telemetry(samples)
+        fusion.add_earlier(seen.stamps_s, gauge.T_m_c[:166], gauge.sigma_t, gauge.sigma_r)
+        fusion.revise(seen.stamps_s, gauge.T_m_c[:166])
+
+    _, fusion, gauge = told_of(motion, column("velocity_m_s", 1, np.negative), feed)
+    asked = (motion.stamps_s > 7.9) & (motion.stamps_s < 8.75)
+    p = gauge.T_m_c[asked][::4, :3, 3]
+    reported = fusion.telemetry().positions(motion.stamps_s[asked][::4], p)
+    assert fusion.telemetry().velocity
+    chi2 = p.ravel() @ reported.information @ p.ravel() - 2 * reported.vector @ p.ravel() + reported.constant
+    assert chi2 < 4.0 * reported.rows
 
 
 def test_a_column_is_proven_by_motion_along_its_axis(told_of):

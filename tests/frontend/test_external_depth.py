@@ -266,7 +266,24 @@ def test_constant_output_gives_no_relative_depth():
         assert np.isnan(relative_depth(np.full((4, 4), value, np.float32))).all()
 
 
+def test_a_preset_can_be_corrected(tmp_path, image):
+    path = describe(green_network(tmp_path / "n.onnx"), 'preset = "metric3d-v2-small"\ndepth = ""\nmultiple = 14\n')
+    assert open_depth(path).network.multiple == 14
+
+
 def test_input_of_any_size_gets_a_default_with_a_remark(tmp_path, caplog):
     network = open_depth(describe(green_network(tmp_path / "net.onnx"), 'gives = "metres"\nmultiple = 14\n'))
     assert network.network.input_height == network.network.input_width == 518
     assert "say input_height and input_width" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "record",
+    ['{"gives": ["metres"]}', '{"gives": "metres", "preset": []}', '{"gives": "metres", "mean": [[1], 2, 3]}', "[[[["],
+)
+def test_record_of_odd_types_is_one_line(tmp_path, record):
+    model = onnx.load(green_network(tmp_path / "net.onnx"))
+    model.metadata_props.add(key="edgeslam.depth", value=record)
+    onnx.save(model, tmp_path / "net.onnx")
+    with pytest.raises(WeightsError):
+        open_depth(tmp_path / "net.onnx")

@@ -7,8 +7,6 @@ from numeric import edges_along, pixels
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.mapping.edge_association import EdgeField, EdgePairs, associate_edges, edge_field, nearest_edges
-from edgeslam_torch.optim.local_ba import refine_window
-from edgeslam_torch.optim.problem import EdgeTerms, LmConfig, WindowProblem
 from edgeslam_torch.types import Edges, FloatArray
 
 K = (500.0, 500.0, 319.5, 239.5)
@@ -92,32 +90,3 @@ def test_the_edge_that_runs_the_same_way_is_found_beside_a_nearer_crossing_one()
     at = np.array([[103.0, 100.0]])  # the level one is nearer
     assert nearest_edges(field, at, np.array([[1.0, 0.0]]), 5.0) == 20
     assert nearest_edges(field, at, np.array([[0.0, 1.0]]), 5.0) == 41
-
-
-def test_edges_alone_recover_a_pose(rng):
-    T, fields = two_views(rng)
-    edges, depth = fields[0].edges, fields[0].inverse_depth
-    E = len(edges.uv)
-    start = np.stack([T[0], se3.exp(np.array([0.01, -0.01, 0.01, 0.002, -0.003, 0.004])) @ T[1]])
-    none = np.zeros(0)
-    for _ in range(4):  # associate, refine, again
-        pairs = pairs_of(start, fields, max_px=6.0)
-        terms = EdgeTerms(
-            host=np.zeros(E, int),
-            uv=edges.uv,
-            inverse_depth=depth,
-            prior=depth,
-            prior_sigma=0.02 * depth,
-            pair_edge=pairs.pair_edge,
-            pair_pose=pairs.pair_pose,
-            pair_uv=pairs.pair_uv,
-            pair_normal=pairs.pair_normal,
-            pair_inv_sigma=np.full(len(pairs.pair_edge), 2.0),
-            pair_inverse_depth=np.zeros(len(pairs.pair_edge)),
-        )
-        problem = WindowProblem(
-            start, np.array([True, False]), np.zeros((0, 3)), none, none, np.zeros((0, 2)), none, K, edges=terms
-        )
-        start = refine_window(problem, LmConfig(max_iterations=10)).T_c_w
-    # From 1 cm off. Edge pixels are whole pixels and a pixel's depth is that of the first point in it.
-    assert np.abs(se3.log(start[1] @ se3.inverse(T[1]))).max() < 3e-3

@@ -49,6 +49,17 @@ def test_consistent_points_of_two_keyframes_count_twice(points):
     assert (b.observations[:10] == 1).all()
 
 
+def test_points_behind_the_other_keyframe_do_not_count(points, rng):
+    p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:40]
+    a, b = host(points, 0, p_w), host(points, 1, p_w)
+    points.keyframes[1].T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ points.keyframes[1].T_c_w
+    edges = edge_map(points)
+    edges.add(b)
+    edges.add(a)
+    assert (a.observations == 1).all()
+    assert (b.observations == 1).all()
+
+
 def test_edge_points_move_with_their_keyframe(points, rng):
     p_w = points.world.p_w[points.world.visible[0]][:50]
     slow = edge_map(points, voxel=1e-6)

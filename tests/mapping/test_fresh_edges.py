@@ -66,10 +66,21 @@ def test_depth_is_in_the_unit_of_the_poses():
     np.testing.assert_allclose(tripled, 3.0 * z, rtol=1e-3)
 
 
+def test_depths_outside_the_bounds_are_not_measured():
+    _, z = measured(stereo(board_before_a_wall()), nearest=1.5)
+    assert (z > 1.4).all()
+
+
 def test_a_rotation_gives_no_depth():
     flight = board_before_a_wall()
     on_the_spot = np.repeat(flight.T_w_c[4:], 5, axis=0)
     assert len(measured(stereo(flight, on_the_spot))[1]) == 0
+
+
+def test_views_without_baseline_do_not_displace_others():
+    alone, _ = measured(stereo(board_before_a_wall()))
+    crowded, _ = measured(stereo(board_before_a_wall()), (4, 4, 4, 4, 0, 1, 2, 3))
+    np.testing.assert_array_equal(alone, crowded)
 
 
 def test_a_view_with_a_long_baseline_is_not_used():

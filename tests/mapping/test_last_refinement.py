@@ -10,8 +10,10 @@ from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
+from edgeslam_torch.mapping import refinement
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
-from edgeslam_torch.mapping.last_refinement import last_refinement
+from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
+from edgeslam_torch.mapping.motion_terms import MotionFactors
 from edgeslam_torch.optim.problem import StopReason, WindowResult
 
 POINTS = WindowConfig(alignment=False, cycle="off")
@@ -63,18 +65,6 @@ def test_edges_are_refined_and_their_depths_written_back():
     assert np.median(moved[moved > 0]) < 0.03
 
 
-def test_edges_measured_at_another_scale_follow_the_map():
-    """As after a turn: the refinement of the anchors changes the scale of what was measured before it."""
-    slam_map, edges, log = flown()
-    for host in edges.hosts:  # measured when everything was nearer
-        host.grow(0.8)
-    last_refinement(slam_map, CAMERA, edges, WindowConfig())
-    _, right, _, _ = finish(WindowConfig())
-    depths = [np.median(np.concatenate([h.p_c[:, 2] for h in e.hosts])) for e in (edges, right)]
-    assert depths[0] == pytest.approx(depths[1], rel=0.01)
-    assert ate(log) < 0.02
-
-
 def test_edges_measured_with_wrong_poses_are_measured_again():
     """Half as far as the anchors of that time had them, and these have moved since: no common factor mends that."""
     slam_map, edges, log = flown()
@@ -90,6 +80,12 @@ def test_edges_measured_with_wrong_poses_are_measured_again():
     assert ate(log) < 0.02
 
 
+def test_without_reprojection_anchors_are_unchanged():
+    start, _, _ = flown()
+    slam_map, _, _, _ = finish(FORMS["no reprojection"])
+    np.testing.assert_allclose(slam_map.anchors.p_w, start.anchors.p_w, rtol=0, atol=1e-12)
+
+
 def test_a_non_finite_anchor_skips_the_refinement_and_preserves_the_map():
     slam_map, edges, log = flown()
     held = int(slam_map.latest().anchor.max())
@@ -99,6 +95,26 @@ def test_a_non_finite_anchor_skips_the_refinement_and_preserves_the_map():
     check_map(slam_map)
     np.testing.assert_allclose(log.poses()[1], before, atol=1e-12)
     assert len(slam_map.anchors) > 300
+
+
+def test_the_last_refinement_uses_the_full_weight_of_telemetry(monkeypatch):
+    """Thirty times, as in flight, bends what is straight."""
+    flown()
+    asked = []
+
+    def factors(model, keyframes, piece, doubt, effective_samples):
+        asked.append(effective_samples)
+        return MotionFactors()
+
+    monkeypatch.setattr(refinement, "motion_factors", factors)
+    finish(WindowConfig())
+    assert set(asked) == {1.0}
+
+
+def test_forms_of_the_terms_in_flight():
+    assert lm_config(WindowConfig()).robust
+    assert not lm_config(WindowConfig(reprojection="literal")).robust
+    assert lm_config(WindowConfig(reprojection="off")).max_iterations == 0
 
 
 def test_an_unknown_form_is_rejected():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from point_map import CAMERA, PointMap, check_map, filled, small_motion
+from point_map import CAMERA, PointMap, check_map, filled
 
 from edgeslam_torch.config import MappingConfig, SlamConfig
 from edgeslam_torch.frontend.matching import words
@@ -62,15 +62,6 @@ def test_keypoints_of_a_new_keyframe_are_aligned_with_the_views_before_it(rng, s
     assert np.isfinite(points.keyframes[2].aligned_px).any() == sub_pixel
 
 
-def test_pose_error_of_a_new_keyframe_is_corrected(rng):
-    points = PointMap(rng, 400, 5)
-    anchor_of = points.fill([0, 1, 2, 3])
-    points.keyframes[4].T_c_w = small_motion(rng, 0.01, 0.004) @ points.keyframes[4].T_c_w
-    result = insert(make_mapper(points), points, 4, anchor_of)
-    assert result is not None
-    assert np.abs(se3.log(points.keyframes[4].T_c_w @ se3.inverse(points.world.T_c_w[4]))).max() < 1e-3
-
-
 def test_new_anchors_that_are_not_found_again_are_removed(rng):
     points = PointMap(rng, 400, 3)
     anchor_of = points.fill([0, 1])
@@ -118,6 +109,17 @@ def test_the_only_views_of_a_place_are_kept_in_a_full_map(rng, monkeypatch):
     mapper.cull_keyframes(points.keyframes[-1])
     assert home <= set(points.map.keyframes) and len(points.map.keyframes) == 12
     check_map(points.map)
+
+
+def test_a_map_of_unique_views_grows_to_twice_the_limit(rng, monkeypatch):
+    points = filled(rng, 900, 30)
+    for keyframe in points.keyframes:  # each anchor is left to two neighbours
+        others = keyframe.anchor % 15 != keyframe.id // 2
+        points.map.forget_observations(keyframe, np.flatnonzero((keyframe.anchor >= 0) & others))
+    monkeypatch.setattr("edgeslam_torch.mapping.mapper.REDUNDANCY", 1.0)
+    mapper = make_mapper(points, max_keyframes=12, window=5, window_fixed=5)
+    mapper.cull_keyframes(points.keyframes[-1])
+    assert len(points.map.keyframes) == 24
 
 
 def test_redundant_keyframes_are_removed_except_the_first_and_last(rng, monkeypatch):

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.map.keyframe import NO_ANCHOR
 from edgeslam_torch.map.revisit import MIN_SHARED, is_back
 from edgeslam_torch.mapping.last_refinement import lm_config
 from edgeslam_torch.mapping.mapper import Mapper
@@ -128,6 +130,25 @@ def test_a_rotation_is_no_revisit(there_and_back):
     way = max(np.linalg.norm(keyframes[8].centre_w - k.centre_w) for k in keyframes[4:8])
     assert not back(keyframes, 6, 12, 1.01 * way)
     assert back(keyframes, 6, 12, 0.99 * way)
+
+
+def test_an_earlier_rotation_elsewhere_is_no_revisit(there_and_back):
+    """It turns where it begins, flies on with the place in view, and turns again."""
+    keyframes = there_and_back.keyframes
+    keyframes[1].anchor[:] = NO_ANCHOR
+    for keyframe in keyframes:
+        at = np.array([10.0 if keyframe.id > 2 else 0.0, 0.0, 0.0])
+        keyframe.T_c_w[:3, 3] = -keyframe.T_c_w[:3, :3] @ at
+    assert not back(keyframes, 4, 12, 1.0)
+
+
+def test_a_slowly_vanishing_view_is_no_loss_of_view(there_and_back):
+    keyframes = there_and_back.keyframes
+    common = reduce(np.intersect1d, [k.anchor[k.anchor >= 0] for k in keyframes[:4]])
+    for few in (3, MIN_SHARED // 2):
+        for keyframe in keyframes[4:8]:
+            keyframe.anchor[:few] = common[:few]
+        assert back(keyframes, 4, 12) == (few == 3)
 
 
 def test_a_revisited_map_does_not_follow_telemetry(there_and_back):
@@ -253,6 +274,16 @@ def test_gravity_alone_levels_an_unconstrained_map(rng, halves):
     window = Window(halves.keyframes[3:], halves.keyframes[:3], halves.map.anchors_seen_by(halves.keyframes))
     refine(halves.map, window, CAMERA, LmConfig(max_iterations=50), model)
     assert tilt_deg(halves) < 0.5
+
+
+def test_gravity_dominates_in_a_new_map_without_metric_scale(rng, halves):
+    """Then depths are guesses, and a drone's attitude has the error of its quantisation; not after that."""
+    model = telemetry_of(rng, halves)
+    (before,), (after,) = (
+        motion_factors(m, halves.keyframes, [0] * 6).gravity
+        for m in (replace(model, scale_sigma_log=np.inf, velocity=False, new_map=True), model)
+    )
+    assert np.degrees(before.sigma_rad) < 0.4 < 0.5 < np.degrees(after.sigma_rad)
 
 
 def test_a_whole_map_may_use_the_full_weight_of_telemetry(rng, halves):

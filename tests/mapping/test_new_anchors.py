@@ -75,6 +75,11 @@ def test_wrong_pairs_do_not_triangulate(points, rng):
     assert len(used) < 0.05 * len(query)
 
 
+def test_too_little_parallax_is_rejected(points):
+    matches = matched(points, points.depths(0))
+    assert len(triangulated(points, matches, 60.0)[2]) == 0
+
+
 def test_a_level_that_contradicts_the_distance_is_rejected(points):
     matches = matched(points, points.depths(0))
     points.keyframes[1].features.octave[:] = 6

@@ -134,3 +134,9 @@ def test_triangulated_anchors_have_no_slack(points):
     assert not mostly_on_priors(points.map.anchors, ids)
     points.map.anchors.from_depth[ids[: len(ids) // 2 + 1]] = True
     assert mostly_on_priors(points.map.anchors, ids)
+
+
+def test_sigma_of_predicted_depth_is_at_least_half():
+    """Whatever sigma it states: inverse depth 1 / z, and at least half of that for its standard deviation."""
+    prior = prior_of(np.array([2.0, 4.0, 4.0]), np.array([0.05, 0.3, 0.8]))
+    np.testing.assert_allclose(prior, [[0.5, 0.25], [0.25, 0.125], [0.25, 0.2]])

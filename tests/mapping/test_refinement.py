@@ -45,17 +45,6 @@ def test_at_least_two_keyframes_fix_the_gauge(points, free, fixed):
     np.testing.assert_array_equal(window.anchor, points.map.anchors_seen_by(window.free))
 
 
-def test_a_disturbed_window_is_recovered_exactly(points, rng):
-    window = choose_window(points.map, points.keyframes[-1], 4, 15)
-    for keyframe in window.free:
-        keyframe.T_c_w = small_motion(rng, 0.02, 0.01) @ keyframe.T_c_w
-    points.map.anchors.p_w[window.anchor] += rng.normal(0.0, 0.02, (len(window.anchor), 3))
-    refine(points.map, window, CAMERA, LmConfig())
-    assert pose_errors(points, window.free).max() < 1e-4
-    assert pose_errors(points, window.fixed).max() < 1e-12
-    check_map(points.map)
-
-
 @pytest.mark.parametrize("what", ["anchor", "pixel"])
 def test_a_window_that_cannot_be_refined_is_unchanged(points, what):
     """A NaN in the solver's result leaves poses, anchors and observations unchanged."""

@@ -115,3 +115,16 @@ def test_concurrent_replacement_of_anchors_is_atomic(slam):
     cloud = slam.anchors()
     assert len(cloud.p_w) == len(alive) > 100
     assert np.unique(cloud.colour).tolist() == np.unique(cloud.sigma_m).tolist()
+
+
+def test_concurrent_removal_of_a_keyframe_is_atomic(slam):
+    last = slam.map.keyframes[2]
+
+    class Meddled(dict):
+        def __getitem__(self, id):
+            if id == 0:
+                beside(slam.map.lock, lambda: slam.map.remove_keyframe(last))
+            return super().__getitem__(id)
+
+    slam.map.keyframes = Meddled(slam.map.keyframes)
+    assert [k.id for k in slam.keyframes()] in ([0, 1], [0, 1, 2])

@@ -12,6 +12,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.mapping.edge_association import edge_field
 from edgeslam_torch.mapping.window_terms import (
     Structure,
+    TermConfig,
     collinearity_prior,
     edge_terms,
     junction_terms,
@@ -82,6 +83,15 @@ def test_terms_fit_at_the_true_poses(scene):
     result = refine_window(p, LmConfig(max_iterations=0))
     # rows of a corner within 1 px and of an arm within 1 / 20 rad cost less than one each
     assert result.cost_after < 0.7 * (len(edges.pair_edge) + 4 * len(junctions.pair_junction))
+
+
+def test_limits_of_terms_apply(scene):
+    T, structures = scene
+    placed = edge_terms(structures, T, K, TermConfig(edges_per_pose=100, targets=1))
+    assert placed is not None
+    edges = placed.terms
+    assert np.bincount(edges.host).max() <= 100
+    assert np.bincount(edges.pair_edge).max() == 1
 
 
 def test_a_corner_with_other_arm_directions_is_not_matched(scene):

@@ -183,7 +183,7 @@ def test_depth_priors_set_the_scale(rng):
     assert len(result.chi2) == len(window.problem.uv)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_search_ended_by_the_poses_is_at_the_minimum_within_the_tolerance(seed):
     """The distance of the costs is the squared distance of the states in standard deviations."""
     problem = points_only(seeded_window(seed, SMALL)).problem
@@ -248,26 +248,6 @@ def test_degenerate_window_ends_with_a_reason_and_a_finite_state(name, rng):
         np.testing.assert_array_equal(result.T_c_w, problem.T_c_w)
     if name in ("no motion", "every anchor seen once", "pure rotation", "two keyframes"):
         assert result.rank_deficiency >= 1
-
-
-@pytest.mark.parametrize("name", ["pure rotation", "all behind", "one plane"])
-def test_degenerate_window_with_edges_and_corners_ends_with_a_reason_and_a_finite_state(name):
-    problem = seeded_window(22, SMALL).problem
-    T = problem.T_c_w.copy()
-    if name == "pure rotation":
-        T[:, :3, 3] = 0.0
-    if name == "all behind":
-        T[1:] = np.diag([1.0, -1.0, -1.0, 1.0]) @ T[1:]
-    if name == "one plane":
-        flat = np.full(len(problem.edges.host), 0.25)
-        problem = replace(problem, edges=replace(problem.edges, inverse_depth=flat, prior=flat))
-        problem.p_w[:, 2] = 4.0
-    result = refine_window(replace(problem, T_c_w=T), LmConfig(max_iterations=25))
-    assert isinstance(result.stop, StopReason)
-    assert result.cost_after <= result.cost_before
-    for state in (result.T_c_w, result.p_w, result.edge_inverse_depth, result.junction_inverse_depth):
-        assert np.isfinite(state).all()
-    assert (result.edge_inverse_depth > 0).all()
 
 
 @pytest.mark.parametrize(

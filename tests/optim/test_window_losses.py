@@ -10,7 +10,9 @@ from seeded_window import Noise, WindowSize, seeded_window
 from edgeslam_torch.losses import AngleLoss, CycleLoss, EdgeAlignmentLoss, ReprojectionLoss
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.optim.adaptive import window_losses
-from edgeslam_torch.optim.problem import WindowProblem
+from edgeslam_torch.optim.local_ba import refine_window
+from edgeslam_torch.optim.problem import LmConfig, WindowProblem
+from edgeslam_torch.optim.window import refined
 
 SMALL = WindowSize(poses=6, fixed=2, anchors=100, observations=400, edges=150, pairs=500, junctions=30)
 FORMS = [CycleForm.RELATIVE_DEPTH, CycleForm.PIXEL]
@@ -68,6 +70,13 @@ def test_losses_are_the_modules_mean_squares(form):
     cosine = torch.as_tensor((j.pair_arms[:, 0] * j.pair_arms[:, 1]).sum(1))[:, None]
     assert losses["angle"] == pytest.approx(float(AngleLoss()(motion, pixel, depth, cosine, K).mean()), rel=1e-9)
     assert losses["total"] > 0.0
+
+
+def test_refinement_lowers_every_loss_of_a_disturbed_window():
+    problem = noisy(CycleForm.RELATIVE_DEPTH)
+    result = refine_window(problem, LmConfig(max_iterations=20))
+    before, after = window_losses(problem), window_losses(refined(problem, result))
+    assert all(after[name] < before[name] for name in before if name != "total")
 
 
 def test_terms_that_are_off_are_left_out():

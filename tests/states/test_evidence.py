@@ -13,7 +13,7 @@ from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
 from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
-from edgeslam_torch.types import DepthMap
+from edgeslam_torch.types import DepthMap, Units
 
 NO_NETWORK = SlamConfig(depth=DepthConfig(weights="none"))
 
@@ -89,6 +89,20 @@ def test_visual_sigma_is_that_of_the_visual_errors(monkeypatch):
     off = np.sqrt(np.median(jitter**2) / 2.0) / 0.6745
     sigma = np.median([call[2] for call in told])
     assert off / 3.0 < sigma < 3.0 * off + 0.002
+
+
+def test_the_final_scale_is_computed_from_refined_poses(monkeypatch):
+    slam = EdgeSlam(CAMERA, NO_NETWORK, depth=panels().depth_function())
+    for frame in panels().frames:
+        slam.step(frame)
+    before = slam.log.poses()[1].copy()
+    told = spied(monkeypatch, "revise")
+    slam.finish()
+    ((stamps, T_w_c),) = told
+    np.testing.assert_array_equal(stamps, panels().stamps_s)
+    np.testing.assert_array_equal(T_w_c, slam.log.poses()[1])
+    assert np.abs(T_w_c - before).max() > 1e-6, "refinement changed them"
+    assert slam.scale.units is Units.METRES
 
 
 def test_a_frozen_video_gives_one_measurement(monkeypatch):

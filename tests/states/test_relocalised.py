@@ -103,6 +103,19 @@ def test_the_gate_uses_the_shortest_covisibility_path():
     assert flown.finds(4.7) is not None
 
 
+def test_the_shortest_path_continues_into_a_new_submap():
+    """The same with a submap that begins there: its scale is uncertain, the path before it is not."""
+    flown = Flown(between=0.01)
+    flown.keyframes[4].centre_w = np.array([4.9, 0.0, 0.0])
+    for k in range(1, 4):
+        flown.keyframes[k].centre_w = np.array([10.0 * k, 0.0, 0.0])
+    flown.piece_of[5] = 1
+    assert flown.finds(3.7) is not None
+    flown.sees_again = {0: 30}
+    assert flown.finds(3.7) is None
+    assert flown.finds(4.7) is not None
+
+
 def test_relocalisation_with_a_wrong_heading_is_rejected():
     """Two sides of a room with the same shelves."""
     assert Flown().finds(5.0, turned_deg=15.0) is not None

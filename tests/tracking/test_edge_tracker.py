@@ -65,6 +65,11 @@ def test_edges_alone_find_the_pose(flight, tracker, rng, index):
     assert pose.edges > 300
 
 
+def test_disabled_tracking_uses_no_edges(flight, tracker):
+    off = EdgeTracker(tracker.map, tracker.edges, tracker.camera, enabled=False)
+    assert off.refine(grey_of(flight, 1), se3.inverse(flight.T_w_c[1])) is None
+
+
 def test_a_wrong_pose_from_a_distant_prediction_is_rejected(flight, tracker, rng):
     """Up to 30 px: edges meet the wrong neighbours, in some starts; no such pose counts as fixed."""
     found = 0

@@ -17,7 +17,9 @@ from edgeslam_torch.map.keyframe import NO_ANCHOR, make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.tracking.flow import (
+    LEVELS,
     MIN_SHARE,
+    NEAR_LEVELS,
     FlowTracker,
     join,
     template_of_keyframe,
@@ -79,6 +81,14 @@ def test_pose_is_accurate_to_half_a_pixel_from_a_prediction_error_of_ten(scene, 
     assert (np.sqrt(np.diag(followed.track.covariance)) < 0.02).all()
 
 
+def test_the_number_of_tracked_keypoints_is_limited_and_they_are_spread(scene):
+    tracker = scene.tracker(points=60)
+    track = tracker.follow(scene.template, scene.grey, scene.keyframe.T_c_w).track
+    assert track.matches <= 60
+    uv = scene.keyframe.features.uv[track.matched_keypoint]
+    assert len({(int(u // 80), int(v // 80)) for u, v in uv}) >= 11  # cells of a 4 x 3 grid
+
+
 def test_keypoints_out_of_view_count_against_the_share(scene, monkeypatch):
     """Turned until a part has left the image: what is left tells the pose, and the share that it is less."""
     turned = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, 0.3, 0]))
@@ -93,6 +103,15 @@ def test_keypoints_out_of_view_count_against_the_share(scene, monkeypatch):
     assert lost_most(replace(followed, share=0.6))
 
 
+def test_a_pose_uses_the_keypoints_in_view(scene):
+    """A third of the template is left, and nearly all of that is found: no reason to be lost."""
+    turned = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, 0.75, 0]))
+    followed = scene.tracker().follow(scene.template, grey_at(turned), se3.inverse(turned))
+    assert followed.share < MIN_SHARE
+    assert followed.trusted
+    assert error(followed.track.T_c_w, turned)[0] < 0.02
+
+
 def test_few_inliers_in_view_give_a_prediction_but_no_pose(scene):
     """Most of the image is blurred: what is left agrees, and is no evidence about the other anchors."""
     grey = scene.grey.copy()
@@ -104,6 +123,22 @@ def test_few_inliers_in_view_give_a_prediction_but_no_pose(scene):
     assert followed.share < MIN_SHARE
     assert error(followed.track.T_c_w, POSES[0])[0] < 0.05
     np.testing.assert_array_equal(scene.map.anchors.visible, before)
+
+
+def test_all_pyramid_levels_are_used_only_if_they_find_more(scene, monkeypatch):
+    """Coarse levels lose keypoints near the border of the image."""
+    tracker, tried = scene.tracker(), []
+    found = FlowTracker._locate
+
+    def locate(self, template, grey, keypoint, guess, T_c_w, levels, expected):
+        tried.append(levels)
+        some = keypoint[: len(keypoint) // (2 if levels == NEAR_LEVELS else 4)]
+        return found(self, template, grey, some, guess[: len(some)], T_c_w, levels, expected)
+
+    monkeypatch.setattr(FlowTracker, "_locate", locate)
+    followed = tracker.follow(scene.template, scene.grey, scene.keyframe.T_c_w)
+    assert tried == [NEAR_LEVELS, LEVELS]
+    assert 0.4 < followed.share < 0.55
 
 
 @pytest.mark.parametrize("what", ["black", "noise", "elsewhere", "behind"])

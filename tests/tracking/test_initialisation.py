@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map
+from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map, small_motion
 
 from edgeslam_torch.config import InitialisationConfig, OrbConfig, TrackingConfig
 from edgeslam_torch.geometry import se3
@@ -15,8 +15,10 @@ from edgeslam_torch.tracking import bootstrap as bootstrap_module
 from edgeslam_torch.tracking.bootstrap import Bootstrap
 from edgeslam_torch.tracking.initialiser import (
     MIN_POINTS,
+    BootstrapView,
     Structure,
     from_essential_matrix,
+    poses_between,
 )
 from edgeslam_torch.tracking.tracker import Tracker, make_view
 from edgeslam_torch.types import DepthMap, Frame
@@ -121,6 +123,16 @@ def test_few_matches_are_rejected_with_a_reason(points):
     assert from_essential_matrix(points.keyframes[0], nine, view_of(points, 4), CAMERA) is None
 
 
+def test_a_frame_between_gets_a_pose_where_it_sees_enough_points(points):
+    a, b = matches(points, 0, 1)
+    rough = small_motion(np.random.default_rng(0), 0.05, 0.02) @ points.world.T_c_w[1]
+    view = BootstrapView(1, points.keyframes[1].features.uv[b], np.ones(len(b)), a, rough)
+    for known, expected in ((a, points.world.T_c_w[1]), (a[:10], rough)):
+        p_w = np.full((len(points.point_of[0]), 3), np.nan)
+        p_w[known] = points.world.p_w[points.point_of[0][known]]
+        np.testing.assert_allclose(poses_between([view], p_w, CAMERA)[0], expected, atol=1e-3)
+
+
 @pytest.fixture(autouse=True)
 def wide_search(monkeypatch):
     """The views lie farther apart than successive frames."""
@@ -223,6 +235,20 @@ def test_intermediate_frames_become_keyframes_in_order(points):
         assert len(keyframe.keypoints_with_anchor()) > 60
     observed = points.map.anchors.observations[points.map.anchors.alive]
     assert (observed >= 4).mean() > 0.8
+
+
+def test_distant_intermediate_frames_are_kept(points):
+    guess = points.depths(0)
+    bootstrap = make_bootstrap(points, guess, InitialisationConfig(keyframe_gap_s=0.01, max_keyframes=2))
+    for index, view in enumerate((1, 1, 1, 2, 3), start=1):
+        seen = view_of(points, view)
+        track = bootstrap.track(seen, points.world.T_c_w[view])
+        bootstrap.two_views(replace(frame_of(points, view), index=index), seen, track)
+        bootstrap.wait(Frame(index, 0.1 * index, np.zeros((4, 4), np.uint8)), seen, track)
+    assert len(bootstrap.waiting) == 2
+    standing_still = {1, 2, 3}
+    assert len(standing_still & {w.frame.index for w in bootstrap.waiting}) <= 1
+    assert bootstrap.waiting[-1].frame.index == 5
 
 
 def test_a_repeated_image_does_not_set_the_maximum_of_matches(points):

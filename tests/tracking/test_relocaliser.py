@@ -65,6 +65,18 @@ def test_a_single_poster_is_rejected(points, rng):
         assert relocaliser.find(index, view, points.keyframes, SOMEWHERE) is None
 
 
+def test_a_repeated_pattern_is_rejected(points, rng):
+    """One keypoint of twelve agrees, all over the image: doors that repeat do as well in the wrong place."""
+    tracker = tracker_of(points)
+    relocaliser = Relocaliser(tracker)
+    view = view_of(points, 3, rng, lambda uv: (uv // 10).sum(axis=1) % 12 == 0)
+    wrong = match_keyframe(tracker, view, points.keyframes[3])
+    assert wrong.inliers >= 2 * tracker.config.min_inliers, "enough by number"
+    assert place_of(tracker, view, wrong).spread > 0.5, "and wide enough"
+    for index in range(AGREEING_FRAMES + 1):
+        assert relocaliser.find(index, view, [points.keyframes[3]], SOMEWHERE) is None
+
+
 @pytest.mark.parametrize("view", [0, 3, 5])
 def test_a_lost_frame_within_reach_is_accepted_at_once(points, rng, view):
     seen = view_of(points, view, rng)

@@ -57,28 +57,19 @@ def test_half_a_pixel_of_noise_moves_the_pose_by_millimetres(points, rng):
     assert (sigma < 0.05).all()
 
 
-def test_a_wrong_prediction_gives_no_pose(points, rng):
-    far = se3.exp(np.array([0, 0, 0, 0, 1.2, 0])) @ points.world.T_c_w[3]
-    assert tracker_of(points).track(view_of(points, 3, rng), far, recent(points, 3)) is None
-
-
-def test_frame_without_keypoints_has_no_pose(points, rng):
-    none = np.zeros(0, np.int32)
-    empty = FrameFeatures(np.zeros((0, 2), np.float32), none, none.astype(np.float32), np.zeros((0, 32), np.uint8))
-    view = make_view(empty, SCALE_FACTOR)
-    tracker = tracker_of(points)
-    assert tracker.track(view, points.world.T_c_w[3], recent(points, 3)) is None
-    assert match_keyframe(tracker, view, points.keyframes[3]) is None
-
-
-def test_another_place_gives_no_pose(points, rng):
-    """A frame of random descriptors at the right pixels."""
-    seen = view_of(points, 3, rng).features
-    bits = rng.integers(0, 256, seen.descriptors.shape, dtype=np.uint8)
-    stranger = make_view(FrameFeatures(seen.uv, seen.octave, seen.angle_rad, bits), SCALE_FACTOR)
-    tracker = tracker_of(points)
-    assert tracker.track(stranger, points.world.T_c_w[3], recent(points, 3)) is None
-    assert all(match_keyframe(tracker, stranger, keyframe) is None for keyframe in points.keyframes)
+@pytest.mark.parametrize("what", ["prediction", "no keypoints", "another place"])
+def test_what_does_not_fit_gives_no_pose(points, rng, what):
+    tracker, T_c_w, seen = tracker_of(points), points.world.T_c_w[3], view_of(points, 3, rng).features
+    if what == "prediction":
+        T_c_w = se3.exp(np.array([0, 0, 0, 0, 1.2, 0])) @ T_c_w
+    elif what == "no keypoints":
+        seen = FrameFeatures(seen.uv[:0], seen.octave[:0], seen.angle_rad[:0], seen.descriptors[:0])
+    else:  # random descriptors at the right pixels
+        bits = rng.integers(0, 256, seen.descriptors.shape, dtype=np.uint8)
+        seen = FrameFeatures(seen.uv, seen.octave, seen.angle_rad, bits)
+    view = make_view(seen, SCALE_FACTOR)
+    assert tracker.track(view, T_c_w, recent(points, 3)) is None
+    assert what == "prediction" or all(match_keyframe(tracker, view, keyframe) is None for keyframe in points.keyframes)
 
 
 def test_anchors_that_are_seen_and_found_are_counted(points, rng):
