@@ -106,11 +106,7 @@ def _tello(size: tuple[int, int]) -> Camera:
 
 
 def _doubts(camera: Camera, name: str) -> list[str]:
-    """Warnings about a calibration that is possible and unlikely.
-
-    Raises:
-        CalibrationError: If it is that of larger or smaller images.
-    """
+    """Warnings about a calibration that is possible and unlikely."""
     doubts = []
     share = unique_share(camera)
     if share < 1.0:

@@ -135,11 +135,7 @@ def _believable(depth: "DepthMap") -> "tuple[DepthMap, float]":
 
 
 def _spare_the_source(out: Path, image: Path | None) -> None:
-    """Refuse to write depth maps beside the images: ``STEM.png`` would overwrite them.
-
-    Raises:
-        OutputError: If the folder is the image's own.
-    """
+    """Refuse to write depth maps beside the images: ``STEM.png`` would overwrite them."""
     if image is not None and out.resolve() == image.resolve().parent:
         raise OutputError(f"{out}: holds the images themselves, which depth maps of the same names would overwrite")
 

@@ -81,11 +81,7 @@ def _record(
     signals: Signals,
     progress: "Progress",
 ) -> None:
-    """One recording, with a summary after landing.
-
-    Raises:
-        EdgeSlamError: If the recording ended early.
-    """
+    """One recording, with a summary after landing."""
     from edgeslam_torch.errors import EdgeSlamError
     from edgeslam_torch.writers.flight_writer import FlightWriter
 

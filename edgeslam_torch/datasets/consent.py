@@ -67,11 +67,7 @@ def fetch(
 
 
 def _ask(collections: dict[Collection, None], agree: bool, say: Callable[[str], None]) -> None:
-    """Show the licences, and go on only with consent.
-
-    Raises:
-        ConfigError: Without.
-    """
+    """Show the licences, and go on only with consent."""
     for collection in collections:
         say(f"{collection.name} is not ours. Licence: {collection.licence} ({collection.terms})")
         say(f"    its authors ask to cite: {collection.cite}")

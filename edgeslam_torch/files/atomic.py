@@ -55,9 +55,5 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write ``text`` to ``path`` as UTF-8, atomically; undecodable bytes of file names become question marks.
-
-    Raises:
-        OSError: If writing fails.
-    """
+    """Write ``text`` to ``path`` as UTF-8, atomically; undecodable bytes of file names become question marks."""
     write_atomically(path, lambda file: file.write(text.encode("utf-8", errors="replace")))

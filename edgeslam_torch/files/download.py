@@ -191,11 +191,7 @@ def remembered(target: Path) -> str | None:
 
 
 def remember(target: Path, sha256: str) -> Path:
-    """Store a checksum beside its file, in the format of ``sha256sum -c``.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Store a checksum beside its file, in the format of ``sha256sum -c``."""
     path = _checksum_file(target)
     write_text(path, f"{sha256}  {target.name}\n")
     return path

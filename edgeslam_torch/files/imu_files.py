@@ -16,11 +16,7 @@ _HEADER = ",".join(
 
 
 def write_imu(folder: Path, readings: ImuReadings, model: ImuModel) -> None:
-    """Write both files; the reader gives the same readings, with stamps to a nanosecond, and the same model.
-
-    Raises:
-        OSError: If they cannot be written.
-    """
+    """Write both files; the reader gives the same readings, with stamps to a nanosecond, and the same model."""
     values = np.column_stack([readings.angular_rate_rad_s, readings.acceleration_m_s2])
     stamps_ns = np.rint(readings.stamps_s * 1e9).astype(np.int64)
     rows = [

@@ -113,11 +113,7 @@ def open_shared(path: Path) -> BinaryIO:
 
 
 def write_new(path: Path, data: bytes) -> None:
-    """Write a file at once, without waiting for the disk: pictures, of which there are many.
-
-    Raises:
-        OSError: If it cannot be written.
-    """
+    """Write a file at once, without waiting for the disk: pictures, of which there are many."""
     with create(path) as file:
         left = memoryview(data)
         while left:  # after a part, the next call says why not all fits

@@ -88,11 +88,7 @@ def read_entries(file: BinaryIO, sizes: Mapping[str, int]) -> tuple[dict[str, An
 
 
 def write_tensors(path: Path, remarks: Mapping[str, str], arrays: Mapping[str, Array]) -> None:
-    """Write arrays of the types of `KINDS`, atomically.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Write arrays of the types of `KINDS`, atomically."""
     names = {dtype: kind for kind, dtype in KINDS.items()}
     header: dict[str, Any] = {"__metadata__": dict(remarks)}
     begin = 0

@@ -14,11 +14,7 @@ _TEMPLATE = Path(__file__).parent / "template"
 
 
 def write_page(folder: Path, rows: Sequence[Row]) -> None:
-    """Write the page; its links are relative to ``folder``, so that the folder may be moved and shared.
-
-    Raises:
-        OSError: If it cannot be written.
-    """
+    """Write the page; its links are relative to ``folder``, so that the folder may be moved and shared."""
     write_text(folder / PAGE, render(rows))
 
 

@@ -77,11 +77,7 @@ class Row:
 
 
 def write_tables(folder: Path, rows: Sequence[Row]) -> None:
-    """Write ``batch.csv`` and ``batch.json``.
-
-    Raises:
-        OSError: If they cannot be written.
-    """
+    """Write ``batch.csv`` and ``batch.json``."""
     record = {
         "format": FORMAT,
         "version": __version__,

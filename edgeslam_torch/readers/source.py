@@ -235,11 +235,7 @@ def _imu_of(
 
 
 def _file(given: str | Path | None, option: str) -> Path | None:
-    """A file that the user named.
-
-    Raises:
-        SourceError: If it does not exist.
-    """
+    """A file that the user named."""
     path = None if given is None else Path(given).expanduser()
     if path is not None and not path.is_file():
         raise SourceError(f"{option} {path}: no such file")

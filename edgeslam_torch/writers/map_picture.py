@@ -47,9 +47,6 @@ def write_map_picture(
         units: Labels of the axes.
         title: Title of the picture.
         level: Whether z is known to be up.
-
-    Raises:
-        OSError: If the file cannot be written.
     """
     picture: Image = np.full((_HEIGHT, _WIDTH, 3), BACKGROUND, dtype=np.uint8)
     centres = np.asarray(T_w_c, dtype=np.float64).reshape(-1, 4, 4)[:, :3, 3]

@@ -15,11 +15,7 @@ _MAX_BYTES = 1 << 29
 
 
 def write_observations(path: Path, seen: Observations) -> None:
-    """Write the file, atomically.
-
-    Raises:
-        OSError: If it cannot be written.
-    """
+    """Write the file, atomically."""
     arrays = {
         "stamps_s": seen.stamps_s,
         "keyframe": seen.keyframe.astype(np.int32),

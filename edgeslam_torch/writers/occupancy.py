@@ -104,11 +104,7 @@ def occupancy_grid(
 
 
 def write_occupancy(path: Path, grid: OccupancyGrid) -> None:
-    """Write ``path`` with ``.pgm`` and ``.yaml``.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Write ``path`` with ``.pgm`` and ``.yaml``."""
     picture, record = path.with_suffix(".pgm"), path.with_suffix(".yaml")
     height, width = grid.cells.shape
     data = f"P5\n{width} {height}\n255\n".encode("ascii") + grid.cells.tobytes()

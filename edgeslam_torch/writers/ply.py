@@ -51,9 +51,6 @@ def write_ply(path: Path, cloud: PointCloud, comments: tuple[str, ...] = (), nor
         cloud: ``P`` points.
         comments: Lines for the header, such as the units.
         normals: ``(P, 3)`` for ``nx ny nz``; none by default.
-
-    Raises:
-        OSError: If the file cannot be written.
     """
     dtype = VERTEX if normals is None else np.dtype([*VERTEX.descr, *((name, "<f4") for name in NORMAL)])
     vertices = np.empty(len(cloud.p_w), dtype=dtype)

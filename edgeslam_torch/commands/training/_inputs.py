@@ -287,11 +287,7 @@ def items_of(args: argparse.Namespace, ignore_depth: bool) -> list[Item]:
 
 
 def _without_batches(paths: Sequence[Path]) -> list[Path]:
-    """Folders of 'edgeslam batch', or what a shell's ``DIR/*`` makes of one, replaced by the runs in them.
-
-    Raises:
-        SourceError: If no flight of a batch finished.
-    """
+    """Folders of 'edgeslam batch', or what a shell's ``DIR/*`` makes of one, replaced by the runs in them."""
     from edgeslam_torch.fleet.folder import finished_flights, is_beside_flights
 
     found: list[Path] = []

@@ -142,11 +142,7 @@ def _sql_is_read_only_data() -> Iterator[None]:
 
 
 def _check_folder(folder: Path) -> None:
-    """Size of the metadata, and what whole files grow to that are compressed as such.
-
-    Raises:
-        SourceError: If either is out of proportion.
-    """
+    """Size of the metadata, and what whole files grow to that are compressed as such."""
     metadata = folder / "metadata.yaml"
     if metadata.stat().st_size > MAX_METADATA_BYTES:
         raise SourceError(f"{metadata}: more than {MAX_METADATA_BYTES >> 20} MiB of metadata are not read")

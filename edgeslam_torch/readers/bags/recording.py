@@ -127,11 +127,7 @@ def _camera(bag: Bag, choice: Choice, remarks: list[str]) -> Camera | None:
 
 
 def _first_look(bag: Bag, name: str) -> tuple[tuple[int, int], Levels | None]:
-    """Size of most pictures among the first `_LOOKED_AT`, and levels of those of more than eight bits.
-
-    Raises:
-        SourceError: If none can be read.
-    """
+    """Size of most pictures among the first `_LOOKED_AT`, and levels of those of more than eight bits."""
     decoder = PictureDecoder(f"{bag.path.name}:{name}")
     sizes: list[tuple[int, int]] = []
     faults: list[str] = []

@@ -120,11 +120,7 @@ def _by_poses(folder: Path, folders: Sequence[Path]) -> dict[str, Any]:
 
 
 def _coverage(model: ImuModel, readings: ImuReadings, first_s: float, last_s: float) -> list[str]:
-    """Remark about frames without readings.
-
-    Raises:
-        SourceError: If no frame has any.
-    """
+    """Remark about frames without readings."""
     begin_s, end_s = readings.stamps_s[[0, -1]] - (model.time_offset_s or 0.0)
     if end_s < first_s or begin_s > min(last_s, first_s + _LONGEST_S):
         until = f" to {last_s:.2f}" if math.isfinite(last_s) else ""

@@ -43,11 +43,7 @@ def read(folder: Path) -> Sequence:
 
 
 def _images(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
-    """Images of one ``camN`` folder in time order.
-
-    Raises:
-        SourceError: If there is none.
-    """
+    """Images of one ``camN`` folder in time order."""
     listing = folder / "data.csv"
     if not listing.is_file():
         return list_image_folder(folder / "data")

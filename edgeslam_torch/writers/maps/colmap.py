@@ -43,9 +43,6 @@ def write_colmap(
         anchors: What ``seen`` refers to; left out without it.
         seen: Anchors in the images, whose order is that of ``names``.
         comment: Line above the images and the points.
-
-    Raises:
-        OSError: If the file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "cameras.txt", _camera_text(camera))

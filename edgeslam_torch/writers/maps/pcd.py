@@ -12,11 +12,7 @@ POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<f4"), ("si
 
 
 def write_pcd(path: Path, cloud: PointCloud, comment: str = "") -> None:
-    """Write a cloud, atomically, with a comment in its header.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Write a cloud, atomically, with a comment in its header."""
     points = np.empty(len(cloud.p_w), dtype=POINT)
     for axis, name in enumerate(("x", "y", "z")):
         points[name] = cloud.p_w[:, axis]
