@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from edgeslam_torch.terminal.progress import Progress
     from edgeslam_torch.types import FloatArray
 
-HELP = "export the depth network to ONNX (float32, float16 or int8)"
-
 PARITY_RTOL = 1e-4
 """Maximum relative difference of depth between torch and onnxruntime in float32."""
 CALIBRATION_IMAGES = 96

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from edgeslam_torch.models.onnx.external import ExternalNetwork
     from edgeslam_torch.models.record import Metadata
 
-HELP = "list, download, convert and inspect depth-network weights"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""

@@ -1,7 +1,6 @@
 """Work in processes of its own, some at a time: time and memory of each are bounded, and a stop ends all of them."""
 
 import io
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -188,19 +187,6 @@ def end_with_parent() -> None:
 
     def wait() -> None:
         os.read(stdin, 1)  # not sys.stdin, whose lock would abort the interpreter's shutdown
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
-def end_with_parent_process() -> None:
-    """The same in a process of `multiprocessing`: a pool's workers else go on to the end of what they do."""
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-
-    def wait() -> None:
-        parent.join()
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()

@@ -1,7 +1,5 @@
 """Watched processes; those here are tiny scripts."""
 
-import os
-import select
 import subprocess
 import sys
 from contextlib import closing
@@ -82,32 +80,3 @@ def test_process_ends_with_the_one_that_holds_its_stdin():
     child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
     child.stdin.close()  # as when its parent dies
     assert child.wait(timeout=30) == 1
-
-
-POOL = """
-import os, time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
-from edgeslam_torch.jobs.watched import end_with_parent_process
-
-def work():
-    print(os.getpid(), flush=True)
-    time.sleep(60)
-
-if __name__ == "__main__":
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=end_with_parent_process) as pool:
-        pool.submit(work).result()
-"""
-
-
-@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux tells of the end of a process that is no child")
-def test_a_pools_worker_ends_with_the_process_that_started_it(tmp_path):
-    script = tmp_path / "pool.py"
-    script.write_text(POOL)
-    parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
-    worker = os.pidfd_open(int(parent.stdout.readline()))
-    parent.kill()
-    parent.communicate()
-    ended, _, _ = select.select([worker], [], [], 30.0)
-    os.close(worker)
-    assert ended

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from edgeslam_torch.train.hooks import Hooks
     from edgeslam_torch.train.state import TrainConfig
 
-HELP = "distil a larger depth network into a drone-sized one, on recordings without labels"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
