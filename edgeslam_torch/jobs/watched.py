@@ -57,8 +57,6 @@ class Ended:
     reason: str
     """In words; empty when it ended with exit code 0."""
     attempts: int = 1
-    peak_mb: float | None = None
-    """Largest resident memory that was seen [MB]."""
 
 
 class Job:
@@ -80,7 +78,6 @@ class Job:
         self._log = io.TextIOWrapper(create(log), encoding="utf-8", write_through=True)
         self._limits = limits
         self._begun_s = time.monotonic()
-        self._peak_mb: float | None = None
         try:
             self._process = start(folder, self._log)
         except BaseException:
@@ -95,10 +92,10 @@ class Job:
             if broken is None:
                 return None
             self.kill()
-            return Ended(*broken, peak_mb=self._peak_mb)
+            return Ended(*broken)
         self.kill()
         how = How.KILLED if code < 0 else How.ITSELF
-        return Ended(how, last_words(self._log_path, code) if code else "", peak_mb=self._peak_mb)
+        return Ended(how, last_words(self._log_path, code) if code else "")
 
     def kill(self) -> None:
         """End it, and what it started; may be called again."""
@@ -117,11 +114,8 @@ class Job:
         limits = self._limits
         if time.monotonic() - self._begun_s > limits.timeout_s:
             return How.LATE, f"took longer than {limits.timeout_s:.0f} s"
-        memory_mb = resident_mb(self._process.pid)
-        if memory_mb is not None:
-            self._peak_mb = max(self._peak_mb or 0.0, memory_mb)
-            if limits.memory_mb is not None and memory_mb > limits.memory_mb:
-                return How.TOO_LARGE, f"took more than {limits.memory_mb:.0f} MB of memory"
+        if limits.memory_mb is not None and (resident_mb(self._process.pid) or 0.0) > limits.memory_mb:
+            return How.TOO_LARGE, f"took more than {limits.memory_mb:.0f} MB of memory"
         return None
 
 

@@ -68,10 +68,10 @@ class Progress:
             self._thread = threading.Thread(target=self._keep_showing, name="progress", daemon=True)
             self._thread.start()
 
-    def phase(self, what: str, total: int | None = None, unit: str = "", done: float = 0) -> None:
+    def phase(self, what: str, total: int | None = None, unit: str = "") -> None:
         """Begin another part of the work, with a count of its own."""
         self.show()
-        self._begin(what, total, unit, done)
+        self._begin(what, total, unit, 0)
 
     def advance(self, by: float = 1) -> None:
         """Add to the count."""

@@ -19,6 +19,8 @@ FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 MAX_CELLS = 50_000_000
 """Maximum number of cells: 7 km at 1 m, 350 m at 5 cm; more is a mistake of scale or resolution."""
 
+_MIN_POINTS = 2
+"""Of an occupied cell; a single one may be an outlier."""
 _SIGMAS = 2.0
 """A line of sight frees space up to so many sigma before the point that was seen: beyond it, one point in fifty would
 free the wall that it lies on."""
@@ -58,7 +60,6 @@ def occupancy_grid(
     positions: FloatArray,
     resolution_m: float = 0.05,
     z_range_m: tuple[float, float] | None = None,
-    min_points: int = 2,
 ) -> OccupancyGrid:
     """Project obstacles to the floor and mark the space that cameras looked through as free.
 
@@ -69,7 +70,6 @@ def occupancy_grid(
         resolution_m: Side of a cell.
         z_range_m: Heights of obstacles; half a metre below to half a metre above the median camera by default, where
             a drone on this path would hit them.
-        min_points: Minimum number of points of an occupied cell; a single one may be an outlier.
 
     Raises:
         OutputError: If no point lies within the heights or the grid would be too large.
@@ -91,7 +91,7 @@ def occupancy_grid(
     cell = np.floor((p[:, :2] - lower) / resolution_m).astype(int)
     inside = (cell >= 0).all(axis=1) & (cell[:, 0] < width) & (cell[:, 1] < height)
     np.add.at(counts, (cell[inside, 1], cell[inside, 0]), 1)
-    occupied = counts >= min_points
+    occupied = counts >= _MIN_POINTS
     grid = np.full((height, width), UNKNOWN, dtype=np.uint8)
     box = np.array([[*lower, low], [*(lower + np.array([width, height]) * resolution_m), high]])
     free = np.concatenate([_looked_through(seen, resolution_m, box), positions[:, :2]])

@@ -43,7 +43,6 @@ def test_process_that_takes_too_much_memory_is_ended_and_the_others_stay(tmp_pat
     found, started = ends(tmp_path, {"large": LARGE, "small": "pass"}, Limits(60.0, memory_mb=150.0), retries=1)
     assert found["large"].how is How.TOO_LARGE
     assert found["large"].reason == "took more than 150 MB of memory"
-    assert 150 < found["large"].peak_mb < 450
     assert (found["small"].how, found["small"].reason) == (How.ITSELF, "")
     assert started == ["large", "small"], "what is too large once is too large again"
 

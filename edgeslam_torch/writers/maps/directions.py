@@ -10,7 +10,7 @@ _STRAIGHT = 3.0
 """Variance along the edge over that across it, as the camera sees them, from which on neighbours lie on a line."""
 
 
-def edge_directions(p_w: FloatArray, centres_w: FloatArray, neighbours: int = _NEIGHBOURS) -> FloatArray:
+def edge_directions(p_w: FloatArray, centres_w: FloatArray) -> FloatArray:
     """Unit vectors along the edge, from the nearest points.
 
     Points are off along their viewing rays, more than edges are thick. So the line is found across the ray, as in an
@@ -19,13 +19,12 @@ def edge_directions(p_w: FloatArray, centres_w: FloatArray, neighbours: int = _N
     Args:
         p_w: Points ``(P, 3)``.
         centres_w: Cameras ``(K, 3)``; the nearest one's ray counts.
-        neighbours: How many nearest points, the point itself included.
 
     Returns:
         ``(P, 3)`` float32; of both ways along an edge, the one whose largest component is positive. Zero where the
         neighbours lie on no line.
     """
-    count = min(neighbours, len(p_w))
+    count = min(_NEIGHBOURS, len(p_w))
     if count < 3 or len(centres_w) == 0:
         return np.zeros((len(p_w), 3), np.float32)
     p, centres = np.asarray(p_w, np.float64), np.asarray(centres_w, np.float64)
