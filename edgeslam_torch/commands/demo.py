@@ -97,6 +97,8 @@ def _record_many(args: argparse.Namespace, settings: "DemoSettings") -> int:
 
 def report(demo: "DemoResult") -> str:
     """The results in a few lines."""
+    from edgeslam_torch.commands.run import best_view
+
     score, summary = demo.score, demo.run.summary
     metres = score.units == "metres"
     scale = "unknown (arbitrary units)" if not metres else f"{100 * score.scale_error:+.1f} % off"
@@ -115,8 +117,7 @@ def report(demo: "DemoResult") -> str:
             f"{100 * demo.map.within_5cm:.0f} % within 5 cm"
         )
     lines.append(f"speed:      {summary['fps']:.1f} images/s, {summary['cpu_ms_per_frame']:.0f} ms CPU per image")
-    look = next((n for n in ("report.html", "map.png") if (demo.run.folder / n).is_file()), "trajectory.txt")
-    lines.append(f"look at:    {demo.run.folder / look}")
+    lines.append(f"look at:    {demo.run.folder / best_view(demo.run.folder)}")
     return "\n".join(lines)
 
 

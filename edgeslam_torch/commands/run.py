@@ -299,7 +299,7 @@ def _report(result: "RunResult", source: "Source") -> None:
     print(f"map: {counts['edge_points']} edge points, {counts['anchors']} anchors, {counts['keyframes']} keyframes")
     for line in [*summary["joins"], *summary["loops"], *_atlas_words(summary)]:
         print(line)
-    print(f"results: {result.folder} (look at {_best_view(result.folder)})")
+    print(f"results: {result.folder} (look at {best_view(result.folder)})")
 
 
 def _camera_words(camera: "Camera") -> str:
@@ -307,7 +307,8 @@ def _camera_words(camera: "Camera") -> str:
     return f"camera: {camera.source}, {camera.width}x{camera.height}, f {camera.fx:.1f} px{doubt}"
 
 
-def _best_view(folder: Path) -> str:
+def best_view(folder: Path) -> str:
+    """What of a run's folder to look at first."""
     return next((name for name in ("report.html", "map.png") if (folder / name).is_file()), "trajectory.txt")
 
 

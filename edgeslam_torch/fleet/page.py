@@ -21,12 +21,14 @@ def write_page(folder: Path, rows: Sequence[Row]) -> None:
 def render(rows: Sequence[Row]) -> str:
     """The page as text."""
     shown = [column for column in COLUMNS if any(cell(column, row.figures.get(column.name)) for row in rows)]
+    words = {c.name for c in shown if any(isinstance(row.figures.get(c.name), str) for row in rows)}
+    titles = [("flight", False), ("state", False), *((c.title, c.name not in words) for c in shown), ("remarks", False)]
     parts = {
         "style": _part("style.css"),
         "script": _part("sort.js"),
         "summary": html.escape(_summary(rows)),
         "tables": f'<a href="{TABLE}">{TABLE}</a>, <a href="{RECORD}">{RECORD}</a>',
-        "head": "".join(_head(title, numeric) for title, numeric in _titles(shown, rows)),
+        "head": "".join(_head(title, numeric) for title, numeric in titles),
         "rows": "\n".join(_row(row, shown) for row in rows),
     }
     page = _part("page.html")
@@ -48,14 +50,6 @@ def _summary(rows: Sequence[Row]) -> str:
     if named:
         words.append("medians: " + ", ".join(f"{column.title} = {cell(column, value)}" for column, value in named))
     return "; ".join(words) + "."
-
-
-def _titles(shown: Sequence[Figure], rows: Sequence[Row]) -> list[tuple[str, bool]]:
-    return [("flight", False), ("state", False), *((c.title, _is_numeric(c, rows)) for c in shown), ("remarks", False)]
-
-
-def _is_numeric(column: Figure, rows: Sequence[Row]) -> bool:
-    return not any(isinstance(row.figures.get(column.name), str) for row in rows)
 
 
 def _head(title: str, numeric: bool) -> str:

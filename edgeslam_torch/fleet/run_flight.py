@@ -14,7 +14,7 @@ from edgeslam_torch.files.atomic import write_atomically, write_text
 from edgeslam_torch.files.config_file import load_config
 from edgeslam_torch.fleet.folder import FLIGHTS, PICTURES, WORK
 from edgeslam_torch.readers.images import pixels_or_none
-from edgeslam_torch.readers.source import Source, open_source
+from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.run import run, settle_camera
 from edgeslam_torch.writers.run_writer import PICTURE
 
@@ -55,7 +55,8 @@ def run_flight(task: dict[str, Any], folder: Path) -> dict[str, Any]:
     write_report(work, truth if score is not None else None, judge_map=task["map_score"])
     _write_picture(work / PICTURE, batch / PICTURES / f"{name}.jpg")
     work.rename(batch / FLIGHTS / name)
-    notes = [*_notes(source), *result.summary["warnings"], *note, *(score.notes if score is not None else ())]
+    problems = [f"{'left out' if p.frames else 'note'}: {p.file}: {p.reason}" for p in source.problems[:3]]
+    notes = [*problems, *result.summary["warnings"], *note, *(score.notes if score is not None else ())]
     return {"figures": figures(result.summary, score), "notes": notes}
 
 
@@ -97,10 +98,6 @@ def _score(work: Path, truth: str | None, map_score: bool) -> tuple[RunScore | N
         return evaluate_run(work, truth, judge_map=map_score), []
     except EdgeSlamError as error:
         return None, [f"not evaluated: {error}"]
-
-
-def _notes(source: Source) -> list[str]:
-    return [f"{'left out' if p.frames else 'note'}: {p.file}: {p.reason}" for p in source.problems[:3]]
 
 
 def _write_picture(big: Path, small: Path) -> None:

@@ -306,7 +306,8 @@ def _folder_content(folder: Path) -> _Content:
     if recorded is not None:
         return _video_content(recorded, truth)
     found, problems = images.list_image_folder(folder)
-    inside = {child.name: len(images.image_files(child)) for child in _folders_in(folder)} if len(found) < _FEW else {}
+    below = (child for child in sorted(folder.iterdir()) if child.is_dir() and not child.name.startswith("."))
+    inside = {child.name: len(images.image_files(child)) for child in below} if len(found) < _FEW else {}
     if found and inside and max(inside.values()) > len(found):
         more = max(inside, key=lambda name: inside[name])
         raise SourceError(
@@ -350,7 +351,8 @@ def _nothing_in(folder: Path) -> str:
     children = sorted(folder.iterdir()) if folder.is_dir() else []
     if not children:
         return f"{folder}: empty; give a folder of images, a TUM, 7-Scenes or EuRoC sequence, or a video"
-    sequences = [child.name for child in children if child.is_dir() and _looks_like_sequence(child)]
+    folders = (child for child in children if child.is_dir())
+    sequences = [child.name for child in folders if layout_of(child) is not None or images.image_files(child)]
     if sequences:
         more = ", ..." if len(sequences) > 5 else ""
         names = ", ".join(sequences[:5]) + more
@@ -358,14 +360,6 @@ def _nothing_in(folder: Path) -> str:
     suffixes = sorted({child.suffix.lower() or child.name for child in children})
     found = ", ".join(suffixes[:5])
     return f"{folder}: no images or video in it (found {found}); images must be .png or .jpg"
-
-
-def _folders_in(folder: Path) -> list[Path]:
-    return sorted(child for child in folder.iterdir() if child.is_dir() and not child.name.startswith("."))
-
-
-def _looks_like_sequence(folder: Path) -> bool:
-    return layout_of(folder) is not None or bool(images.image_files(folder))
 
 
 def _open_live(spec: str, camera: str | Path | None, telemetry: str | Path | None, max_frames: int | None) -> Source:

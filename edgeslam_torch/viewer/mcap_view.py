@@ -67,15 +67,13 @@ class McapView:
     def on_finish(self, slam: "Slam") -> None:
         """Write the refined path and map, and complete the file."""
         self._guarded(lambda: self._write_map(slam))
-        self._guarded(lambda: self._file.write("/edgeslam/anchors", self._last_s, self._cloud(slam)))
+        ros, t = self._file, self._last_s
+        self._guarded(lambda: ros.write("/edgeslam/anchors", t, messages.cloud(ros, t, slam.anchors())))
         self.close()
 
     def close(self) -> None:
         """Complete the file; may be called repeatedly."""
         self._guarded(self._file.close)
-
-    def _cloud(self, slam: "Slam") -> object:
-        return messages.cloud(self._file, self._last_s, slam.anchors())
 
     def _guarded(self, write: Callable[[], None]) -> None:
         if self.failure is not None:

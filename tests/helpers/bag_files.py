@@ -56,17 +56,16 @@ def header(t, frame=""):
     return {"stamp": stamp(t), "frame_id": frame}
 
 
-def picture(t, pixels, encoding, pad=0, big=False):
-    """``sensor_msgs/Image`` of an array ``(H, W)`` or ``(H, W, C)``, with ``pad`` bytes after each row."""
+def picture(t, pixels, encoding):
+    """``sensor_msgs/Image`` of an array ``(H, W)`` or ``(H, W, C)``."""
     rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
-    rows = np.pad(rows, ((0, 0), (0, pad)), constant_values=77)
     height, width = pixels.shape[:2]
     return {
         "header": header(t, "camera"),
         "height": height,
         "width": width,
         "encoding": encoding,
-        "is_bigendian": int(big),
+        "is_bigendian": 0,
         "step": rows.shape[1],
         "data": rows.tobytes(),
     }
@@ -95,13 +94,13 @@ def compressed(t, data, form):
     return {"header": header(t, "camera"), "format": form, "data": data}
 
 
-def camera_info(size, f, d=(), model="plumb_bob", **changes):
+def camera_info(size, f, d=(), model="plumb_bob"):
     width, height = size
     k = [f, 0.0, (width - 1) / 2, 0.0, f, (height - 1) / 2, 0.0, 0.0, 1.0]
     roi = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
     p = [k[0], 0.0, k[2], 0.0, 0.0, k[4], k[5], 0.0, 0.0, 0.0, 1.0, 0.0]
     info = {"header": header(0.0), "height": height, "width": width, "distortion_model": model, "d": list(d), "k": k}
-    return info | {"r": np.eye(3).ravel().tolist(), "p": p, "binning_x": 0, "binning_y": 0, "roi": roi} | changes
+    return info | {"r": np.eye(3).ravel().tolist(), "p": p, "binning_x": 0, "binning_y": 0, "roi": roi}
 
 
 def xyz(v):
