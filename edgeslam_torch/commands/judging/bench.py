@@ -66,6 +66,7 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.eval.benchmark import benchmark, rows
     from edgeslam_torch.eval.experiment.figures import compared, read_record
 
+    _check_options(args)
     if args.navigation:
         return _navigation(args)
     if args.compare is not None:
@@ -105,6 +106,29 @@ def main(args: argparse.Namespace) -> int:
     return 1 if any(run["error"] for run in runs) else 0
 
 
+_OF_FLIGHTS: dict[str, object] = {
+    "world": [],
+    "fault": [],
+    "behaviour": [],
+    "first_seed": 0,
+    "perception": "truth",
+    "jobs": 1,
+}
+_OF_RECORDINGS: dict[str, object] = {
+    "data": None, "sequence": [], "max_frames": None, "set": [], "get": [], "mode": "offline", "depth": [],
+}  # fmt: skip
+"""Options that only one kind of benchmark has, with their defaults."""
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    """Refuse options of the other kind of benchmark, which would be ignored."""
+    others = _OF_RECORDINGS if args.navigation else _OF_FLIGHTS
+    given = [f"--{name.replace('_', '-')}" for name, unset in others.items() if getattr(args, name) != unset]
+    if given:
+        what = "are of recordings, not of --navigation" if args.navigation else "need --navigation"
+        raise ConfigError(f"{', '.join(given)}: these options {what}")
+
+
 def _fetched(args: argparse.Namespace) -> tuple[Path, list[str]]:
     """Folder of published recordings, and the names that the benchmark has for those of ``--get``."""
     from edgeslam_torch.datasets.consent import fetch, recordings_folder
@@ -141,6 +165,10 @@ def _navigation(args: argparse.Namespace) -> int:
     if not cases:
         raise ConfigError(f"--behaviour corridor: none of {', '.join(worlds)} is a corridor")
     flights = judge_flights(cases, out, args.jobs, say)
+    if args.json is not None:
+        write_text(args.json, json.dumps([flown.record() for flown in flights], indent=1) + "\n")
+    if args.markdown is not None:
+        write_text(args.markdown, markdown(flights))
     print(markdown(flights))
     print(f"results: {out / 'navigation.md'}")
     return 1 if any(flown.contacts or flown.ended.startswith(FAILED) for flown in flights) else 0

@@ -1,5 +1,7 @@
 """The judge of flights."""
 
+import json
+
 import numpy as np
 import pytest
 from markdown_rows import row, rows
@@ -7,6 +9,7 @@ from markdown_rows import row, rows
 from edgeslam_torch.cli import main
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.eval.experiment.runner import Task
+from edgeslam_torch.eval.judge.navigation import table
 from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, corridor_ends, right_exits
 from edgeslam_torch.eval.judge.navigation.flight import fly, shortest_m, true_layer
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
@@ -92,12 +95,26 @@ def test_what_counts_as_reached_is_the_behaviours():
     [
         (["--behaviour", "dance"], "--behaviour: unknown name 'dance'"),
         (["--behaviour", "corridor", "--world", "two_rooms"], "none of two_rooms is a corridor"),
-        (["--first-seed", "-1"], "--first-seed at least 0"),
+        (["--depth", "none", "--max-frames", "9"], "--max-frames, --depth: these options are of recordings"),
     ],
 )
 def test_flights_that_cannot_be_judged_are_refused(arguments, words, capsys):
     assert main(["bench", "--navigation", *arguments]) == 1
     assert words in capsys.readouterr().err
+
+
+def test_options_of_flights_need_them(capsys):
+    assert main(["bench", "--world", "corridor", "--first-seed", "3"]) == 1
+    assert "--world, --first-seed: these options need --navigation" in capsys.readouterr().err
+
+
+def test_the_flights_are_written_where_the_options_say(tmp_path, monkeypatch):
+    flights = [Flown(Case("corridor", 3), reached=True, time_s=30.0)]
+    monkeypatch.setattr(table, "judge_flights", lambda *_: flights)
+    options = ["--json", tmp_path / "f.json", "--markdown", tmp_path / "f.md", "--out", tmp_path / "out"]
+    assert main(["bench", "--navigation", *map(str, options)]) == 0
+    assert [Flown.of_record(record) for record in json.loads((tmp_path / "f.json").read_text())] == flights
+    assert "corridor" in (tmp_path / "f.md").read_text()
 
 
 @pytest.mark.slow
