@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from edgeslam_torch.drone.sdk_state import GRAVITY_M_S2
 from edgeslam_torch.types import FloatArray
 
 DRAG_PER_S = 0.35
@@ -52,4 +53,4 @@ def ground_effect(height_m: float) -> float:
         True
     """
     ratio = _PROPELLER_M / (4.0 * max(height_m, _PROPELLER_M))
-    return 9.80665 * (1.0 / (1.0 - ratio * ratio) - 1.0)
+    return GRAVITY_M_S2 * (1.0 / (1.0 - ratio * ratio) - 1.0)

@@ -7,6 +7,7 @@ from enum import StrEnum
 import numpy as np
 
 from edgeslam_torch.drone.emulator.drone import DroneModel
+from edgeslam_torch.drone.sdk_state import GRAVITY_M_S2
 
 _DIRECTIONS = {
     "forward": (1.0, 0.0, 0.0),
@@ -131,7 +132,7 @@ class Interpreter:
     def _query(self, name: str) -> Reply:
         drone = self.drone
         rpy = np.degrees(drone.rpy())
-        force = 1e3 / 9.80665 * drone.specific_force()
+        force = 1e3 / GRAVITY_M_S2 * drone.specific_force()
         answers = {
             "battery?": f"{math.ceil(100 * drone.battery)}",
             "speed?": f"{self.speed_cm_s:.1f}",

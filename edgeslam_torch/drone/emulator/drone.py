@@ -8,11 +8,11 @@ from enum import StrEnum
 import numpy as np
 
 from edgeslam_torch.drone.emulator.air import DRAG_PER_S, Air, ground_effect
+from edgeslam_torch.drone.sdk_state import GRAVITY_M_S2
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.rotations import matrix_from_rpy, wrapped
 from edgeslam_torch.types import FloatArray
 
-_GRAVITY = 9.80665
 _HOVER_M = 0.8
 _GROUND_M = 0.1
 """Height of camera and range sensor when the drone stands on the floor."""
@@ -234,7 +234,9 @@ class DroneModel:
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         ahead = c * self.lean_m_s2[0] + s * self.lean_m_s2[1] if self.flying else 0.0
         left = -s * self.lean_m_s2[0] + c * self.lean_m_s2[1] if self.flying else 0.0
-        return np.array([-math.atan(left / _GRAVITY), math.atan(ahead / _GRAVITY), float(wrapped(np.array(self.yaw)))])
+        return np.array(
+            [-math.atan(left / GRAVITY_M_S2), math.atan(ahead / GRAVITY_M_S2), float(wrapped(np.array(self.yaw)))]
+        )
 
     def T_w_b(self) -> FloatArray:
         """Body to the drone's world, ``(4, 4)``."""
@@ -245,7 +247,7 @@ class DroneModel:
 
     def specific_force(self) -> FloatArray:
         """Specific force in body axes [m/s^2]."""
-        force = np.array([0.0, 0.0, _GRAVITY]) + (self.acceleration if self.flying else 0.0)
+        force = np.array([0.0, 0.0, GRAVITY_M_S2]) + (self.acceleration if self.flying else 0.0)
         return se3.inverse(self.T_w_b())[:3, :3] @ force
 
 
@@ -256,7 +258,7 @@ def state_line(drone: DroneModel, mission_pads: bool = True) -> str:
     """
     rpy = np.degrees(drone.rpy())
     v = np.trunc(10.0 * drone.velocity * [1.0, -1.0, -1.0] + 0.0).astype(int)
-    force = 1e3 / _GRAVITY * drone.specific_force() * [1.0, -1.0, -1.0]
+    force = 1e3 / GRAVITY_M_S2 * drone.specific_force() * [1.0, -1.0, -1.0]
     height = max(0.0, drone.p_w[2] - _GROUND_M)
     pads = "mid:-1;x:0;y:0;z:0;mpry:0,0,0;" if mission_pads else ""
     return (

@@ -83,19 +83,14 @@ Event = Picture | State | Reply | Contact
 
 @dataclass(slots=True)
 class LockstepTello:
-    """A Tello whose time passes only in `advance`.
-
-    Args:
-        drone: The body.
-        paint: Gives the picture for a body pose ``(4, 4)``.
-        link: Delays and losses.
-        seed: Of the losses.
-    """
+    """A Tello whose time passes only in `advance`."""
 
     drone: DroneModel
     paint: Callable[[FloatArray], np.ndarray]
+    """Gives the picture for a body pose ``(4, 4)``."""
     link: Radio = field(default_factory=Radio)
     seed: int = 0
+    """Of the losses."""
     clock_s: float = 0.0
     _steps: int = 0
     _queue: list[tuple[float, int, object]] = field(default_factory=list)

@@ -20,14 +20,7 @@ Paint = Callable[[FloatArray], np.ndarray]
 def furnished_drone(
     seed: int, tilt_rad: float, size: tuple[int, int], battery: float = 1.0
 ) -> tuple[DroneModel, Paint, Camera]:
-    """A drone on the floor of a seeded room, its renderer, and its camera.
-
-    Args:
-        seed: Of room and place.
-        tilt_rad: Downward tilt of the camera.
-        size: Width and height that are painted [px]; the Tello's camera is scaled to it.
-        battery: Charge in [0, 1].
-    """
+    """A drone on the floor of a seeded room, its renderer, and its camera; the arguments are those of `drone_at`."""
     rng = np.random.default_rng(seed)
     world = place("furnished_room", rng)
     low, high = world.bounds_w
@@ -57,7 +50,7 @@ def drone_at(
     Args:
         site: Where to fly.
         tilt_rad: Downward tilt of the camera.
-        size: Width and height that are painted [px].
+        size: Width and height that are painted [px]; the Tello's camera is scaled to it.
         battery: Charge in [0, 1].
         air: Wind and gusts; still air without it.
         ready: Prepare all textures at once; else each when it is first seen, which takes time between two pictures.
@@ -66,17 +59,12 @@ def drone_at(
         for quad in site.world.quads:
             quad.texture.level(MAX_LEVEL)
             quad.texture.level(MAX_LEVEL - 1)
-    camera = PRESETS["tello"].scaled(*size)
-    T_b_c = camera_on_body(tilt_rad)
-
+    camera, T_b_c = PRESETS["tello"].scaled(*size), camera_on_body(tilt_rad)
     drone = DroneModel(battery=battery, air=air or Air())
-
-    def clearance(p_w: FloatArray) -> float:
-        return float(site.clearance(p_w[None], drone.clock_s)[0])
 
     def paint(T_w_b: FloatArray) -> np.ndarray:
         T_w_c = site.T_site_w @ T_w_b @ T_b_c
         return render(site.painted(drone.clock_s), camera, T_w_c, antialias=False).image
 
-    drone.clearance = clearance
+    drone.clearance = lambda p_w: float(site.clearance(p_w[None], drone.clock_s)[0])
     return drone, paint, camera

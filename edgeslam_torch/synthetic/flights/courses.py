@@ -89,11 +89,7 @@ def simulated_camera(width: int = 640, height: int = 480) -> Camera:
 def flown(course: Course, seed: int, seconds: float | None = None, flight: int = 0) -> tuple[World, Flight, Rng]:
     """World and flight of a course, and the generator for its telemetry.
 
-    Args:
-        course: What is flown.
-        seed: Of the world, and of its first flight.
-        seconds: Length; the course's own when None.
-        flight: Number of a further flight in the same world, on another path.
+    ``seed`` is of the world and its first flight; ``flight`` counts further ones in the same world, on other paths.
 
     Raises:
         ValueError: If the world has no free place to fly in.

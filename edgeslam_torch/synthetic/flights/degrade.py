@@ -94,12 +94,7 @@ def with_motion_blur(
 ) -> np.ndarray:
     """Mean of three images, or five when it moves far, warped along the optical flow while the shutter is open.
 
-    Args:
-        image: ``(H, W, 3)``.
-        depth_m: ``(H, W)`` z-depth.
-        camera: Intrinsics without distortion.
-        twist_c: ``(6,)`` velocity [m/s] and rotation rate [rad/s] of the camera in its own axes.
-        shutter_s: Exposure time.
+    ``twist_c`` ``(6,)`` is the velocity [m/s] and rotation rate [rad/s] of the camera in its own axes.
     """
     v, omega = np.asarray(twist_c[:3], dtype=np.float64), np.asarray(twist_c[3:], dtype=np.float64)
     if shutter_s == 0 or not np.any(twist_c):

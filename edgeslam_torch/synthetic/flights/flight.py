@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.noise import GRAVITY_M_S2
 from edgeslam_torch.synthetic.flights.wind import blown
 from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.types import FloatArray
 
-GRAVITY_M_S2 = 9.81
 KNOT_S = 0.5
 DEGREE = 5
 

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.imu import ImuModel, ImuReadings
+from edgeslam_torch.noise import GRAVITY_M_S2
 from edgeslam_torch.types import FloatArray
 
-GRAVITY_M_S2 = 9.81
 _DEGREE = 5
 
 MPU6050 = ImuModel(source="InvenSense MPU-6050, vibrating")

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.noise import GRAVITY_M_S2
 from edgeslam_torch.synthetic.flights.wind import correlated
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
-GRAVITY_M_S2 = 9.81
 FIELDS = ("vgx", "vgy", "vgz", "pitch", "roll", "yaw", "tof", "h", "baro", "bat", "agx", "agy", "agz")
 """SDK names, in the order of `TelemetryLog.rows`."""
 FLIP = np.array([1.0, -1.0, -1.0])

@@ -51,7 +51,7 @@ def record_flight(
         flight: Where from.
         rng: Of the telemetry's noise.
         camera: Intrinsics.
-        telemetry: How bad the telemetry is; None for none.
+        telemetry: None for none.
         faults: What the camera does to the images.
         seed: Of the image and IMU noise; each frame has its own stream.
         imu: Grade of an IMU in the axes of the drone's body; None for none.

@@ -14,6 +14,7 @@ from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.synthetic.house.scene import PICTURES, VARIANTS, Paint, Place, Scene, random_paint
 from edgeslam_torch.synthetic.house.values import Values
 from edgeslam_torch.synthetic.textures.materials import MATERIALS
+from edgeslam_torch.types import FloatArray
 
 Rng = np.random.Generator
 FILE = Path(__file__).parent.parent / "furniture.toml"
@@ -44,18 +45,8 @@ def stand(scene: Scene, place: Place, rng: Rng, name: str, width: float, depth: 
 
 
 def build(scene: Scene, place: Place, rng: Rng, name: str, **given: Any) -> dict[str, Any]:
-    """Add a piece.
-
-    Args:
-        scene: What it is added to.
-        place: Its axes: x along the wall, y into the room.
-        rng: Of its values.
-        name: Of a table in `furniture.toml`.
-        given: Values that take the place of the table's own.
-
-    Returns:
-        Its values by name, such as the width that was drawn.
-    """
+    """Add a piece of `furniture.toml` at a place (x along the wall, y into the room); ``given`` values take the place
+    of the table's own. Returns its values by name, such as the width that was drawn."""
     table = _tables()[name]
     values = Values(rng, {**_names(), "ceiling": float(scene.high_w[2]), **given}, _paints(rng))
     values.define({key: value for key, value in table.get("values", {}).items() if key not in given})
@@ -125,7 +116,12 @@ def _paints(rng: Rng) -> dict[str, Callable[..., Any]]:
         gain = np.exp(rng.normal(0.0, 0.06, 3))
         return Paint(kind, int(rng.integers(VARIANTS)), tuple(gain.tolist()))
 
+    def direction(length: float) -> FloatArray:
+        axis = rng.normal(size=3)
+        return axis * (length / np.linalg.norm(axis))
+
     return {
+        "direction": direction,
         "paint": paint,
         "variant": lambda: int(rng.integers(VARIANTS)),
         "image": image,

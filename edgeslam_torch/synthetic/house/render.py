@@ -68,13 +68,7 @@ class Rendered:
 
 
 def render(world: World, camera: Camera, T_w_c: FloatArray, *, antialias: bool = True) -> Rendered:
-    """Image, exact depth and quad index of a view.
-
-    Args:
-        world: What to look at.
-        camera: Intrinsics without distortion.
-        T_w_c: Pose, ``(4, 4)``.
-        antialias: Smooth the borders of quads.
+    """Image, exact depth and quad index of the view from a pose ``(4, 4)``; ``antialias`` smooths the borders of quads.
 
     Raises:
         ValueError: If the camera has distortion.

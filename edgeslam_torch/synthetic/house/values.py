@@ -41,6 +41,8 @@ class Values:
             "max": max,
             "round": round,
             "whole": int,
+            "exp": np.exp,
+            "log": np.log,
             "cos": np.cos,
             "sin": np.sin,
             "pi": np.pi,

@@ -6,7 +6,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.dressing import fits, furnish_wall, lamps_anywhere, rug
 from edgeslam_torch.synthetic.house.pieces import build, drawn, furniture, stand
 from edgeslam_torch.synthetic.house.render import Rendered, render
-from edgeslam_torch.synthetic.house.scene import Place, Scene, random_paint
+from edgeslam_torch.synthetic.house.scene import Place, Scene
 from edgeslam_torch.synthetic.house.walls import SIDES, shell, side_of
 from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.types import FloatArray
@@ -42,28 +42,19 @@ def random_room(rng: Rng) -> World:
     if rng.random() < 0.4:
         rug(scene, rng, rng.uniform(-0.2, 0.2) * size[0], rng.uniform(-0.2, 0.2) * size[1])
     if rng.random() < 0.25:
-        _floating_clutter(scene, rng)
+        build(scene, Place(0.0, -0.5 * size[1], 0.0), rng, "floating_clutter", width=size[0], depth=size[1])
     return scene.world("random room")
 
 
 def _in_the_middle(scene: Scene, rng: Rng) -> None:
-    """A table with chairs, cartons or any other piece, standing free."""
-    low, high = scene.low_w[:2] + 0.5, scene.high_w[:2] - 0.5
-    if np.any(high <= low):
-        return
-    x, y = rng.uniform(low, high)
+    """A table with chairs, cartons or any other piece, standing free, where there is room for it."""
+    x, y = rng.uniform(scene.low_w[:2] + 0.5, scene.high_w[:2] - 0.5)
     place = Place(float(x), float(y), float(rng.uniform(-np.pi, np.pi)))
     kind = rng.random()
     if kind < 0.4:
         width, depth = float(rng.uniform(0.7, 1.6)), float(rng.uniform(0.6, 1.0))
-        if not fits(scene, place.at(0, -0.5), width, depth + 1.0):
-            return
-        build(scene, place, rng, "table", width=width, depth=depth)
-        for _ in range(int(rng.integers(1, 4))):
-            side = -1 if rng.random() < 0.5 else 1
-            y_chair = depth / 2 + side * (depth / 2 + rng.uniform(0.05, 0.3))
-            yaw = (np.pi if side > 0 else 0.0) + rng.uniform(-0.5, 0.5)
-            build(scene, place.at(rng.uniform(-0.3, 0.3) * width, y_chair, 0.0, yaw), rng, "chair")
+        if fits(scene, place.at(0, -0.5), width, depth + 1.0):
+            build(scene, place, rng, "table_and_chairs", width=width, depth=depth)
     elif kind < 0.7:
         if fits(scene, place.at(0, -0.4), 0.7, 0.8):
             build(scene, place, rng, "cartons")
@@ -72,23 +63,6 @@ def _in_the_middle(scene: Scene, rng: Rng) -> None:
         width, depth = drawn(rng, name)
         if fits(scene, place, width, depth):
             stand(scene, place, rng, name, width, depth)
-
-
-def _floating_clutter(scene: Scene, rng: Rng) -> None:
-    """Boxes and sheets at any height and angle: depth must not be read off the floor line alone."""
-    for _ in range(int(rng.integers(2, 9))):
-        p = rng.uniform(scene.low_w + 0.4, scene.high_w - 0.4)
-        size = np.exp(rng.uniform(np.log(0.1), np.log(0.8), 3))
-        paint = random_paint(rng, ("dead_leaves", "fabric", "wood", "metal", "terrazzo", "wallpaper"), vivid=0.3)
-        place = Place(float(p[0]), float(p[1]), float(rng.uniform(-3, 3)), float(p[2]))
-        if rng.random() < 0.6:
-            scene.box(place, (0, 0, 0), (size[0], size[1], size[2]), paint, "object", faces="frbltu")
-        else:
-            axes = rng.normal(size=(2, 3))
-            u, v = (a / np.linalg.norm(a) * s for a, s in zip(axes, size[:2], strict=True))
-            scene.surface(p, u, v, paint, "sheet", two_sided=True)
-    width, depth = (scene.high_w - scene.low_w)[:2].tolist()
-    build(scene, Place(0.0, -0.5 * depth, 0.0), rng, "clutter", width=width, depth=depth, count=6)
 
 
 def look(p_w: FloatArray, yaw_rad: float, down_rad: float = 0.0, roll_rad: float = 0.0) -> FloatArray:

@@ -45,15 +45,9 @@ class Wall:
 def shell(
     rng: Rng, low: FloatArray, high: FloatArray, texel_m: float, *, walls: tuple[str, ...], one_paint: bool = False
 ) -> Scene:
-    """Floor, ceiling, outer walls and skirting boards.
+    """Floor, ceiling, outer walls and skirting boards between two inner corners ``(3,)`` [m].
 
-    Args:
-        rng: Of the materials.
-        low: ``(3,)`` inner corner of the walls [m].
-        high: ``(3,)`` the other.
-        texel_m: Size of a texel.
-        walls: Materials to choose from.
-        one_paint: Whether all walls have the same paint.
+    ``walls`` are the materials to choose from; ``one_paint``: all walls have the same paint.
     """
     scene = Scene(low, high, texel_m)
     wide, deep, tall = high - low

@@ -40,13 +40,8 @@ def stand_in_the_way(
 
 
 def connected(scene: Scene, places: Sequence[Sequence[float]]) -> bool:
-    """Whether one can go between places of the floor at heights of flight, `PASSAGE_M` from every solid, and down to
-    the floor at the first of them.
-
-    Args:
-        scene: The solids.
-        places: x and y of each [m].
-    """
+    """Whether one can go between places ``(x, y)`` of the floor at heights of flight, `PASSAGE_M` from every solid, and
+    down to the floor at the first of them."""
     low, high = scene.low_w[:2], scene.high_w[:2]
     to_solid = to_boxes([*scene.boxes, *scene.unseen])
     x, y = (low[k] + (np.arange(np.ceil((high - low)[k] / _GRID_M)) + 0.5) * _GRID_M for k in (0, 1))

@@ -54,12 +54,7 @@ class Walker:
 
 
 def walker(rng: Rng, ends_w: FloatArray, speed_m_s: float) -> Walker:
-    """A grown person in clothes of random colours, somewhere on their way.
-
-    Args:
-        rng: Of size, clothes and place.
-        ends_w: ``(2, 2)`` where they turn round [m].
-        speed_m_s: Of walking.
+    """A grown person of random size and clothes, somewhere on their way between two ends ``(2, 2)`` [m].
 
     Raises:
         ValueError: If the ends are the same place, or they do not walk.

@@ -38,18 +38,10 @@ class Site:
     """People, who are not in `world`."""
 
     def clearance(self, p_w: FloatArray, clock_s: float | None = None) -> FloatArray:
-        """Distance [m] from points ``(N, 3)`` of the drone's own world to the nearest solid.
-
-        Args:
-            p_w: The points.
-            clock_s: When, for sites in which people walk; without it, to what does not move.
-        """
+        """Distance [m] from points ``(N, 3)`` of the drone's own world to the nearest solid, or person at a time."""
         p = self.in_site(p_w)
-        away = self.world.distance_to_solid(p)
-        if clock_s is not None:
-            for walker in self.walkers:
-                away = np.minimum(away, walker.distance(p, clock_s))
-        return away
+        people = [walker.distance(p, clock_s) for walker in self.walkers] if clock_s is not None else []
+        return np.min([self.world.distance_to_solid(p), *people], axis=0)
 
     def painted(self, clock_s: float) -> World:
         """What a camera sees at a time."""

@@ -123,13 +123,8 @@ def test_state_without_mission_pads_is_the_older_form(hovering):
     assert "mid" in parse_state(state_line(hovering))
 
 
-def test_nothing_is_heard_before_the_word_command():
+def test_nothing_is_heard_before_the_word_command_and_movements_on_the_ground_are_refused():
     interpreter = Interpreter(DroneModel())
-    assert interpreter.run("takeoff").when is Answer.NEVER
-    assert not interpreter.drone.flying
-
-
-def test_movements_on_the_ground_are_refused():
-    interpreter = Interpreter(DroneModel())
+    assert interpreter.run("takeoff").when is Answer.NEVER and not interpreter.drone.flying
     interpreter.run("command")
     assert interpreter.run("up 50").text == "error Not joystick"

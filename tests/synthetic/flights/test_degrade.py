@@ -47,6 +47,8 @@ def test_motion_blur_smears_along_the_motion_by_its_length():
     assert abs(changed.mean() - 79.5) < 0.6  # exposure is centred on the stamp
     across = with_motion_blur(step_image(), DEPTH, CAMERA, np.array([0, 1.0, 0, 0, 0, 0]), 0.1)
     np.testing.assert_array_equal(across[20:100], step_image()[20:100])
+    held = with_motion_blur(step_image(), DEPTH, CAMERA, np.array([-1.0, 0, 0, 0, 0.5, 0]), 0.1)
+    np.testing.assert_array_equal(held[:, 70:90], step_image()[:, 70:90])  # it turns to what it passes
 
 
 def test_brightness_follows_the_gain():

@@ -4,9 +4,9 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from edgeslam_torch.noise import GRAVITY_M_S2
 from edgeslam_torch.synthetic.flights import wind
 from edgeslam_torch.synthetic.flights.courses import COURSES, flown
-from edgeslam_torch.synthetic.flights.flight import GRAVITY_M_S2
 
 STAMPS_S = np.arange(4000) / 20
 

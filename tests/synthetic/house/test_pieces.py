@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from edgeslam_torch.synthetic.house.dressing import fits
 from edgeslam_torch.synthetic.house.pieces import build, drawn, furniture, stand
-from edgeslam_torch.synthetic.house.scene import Place, Scene
+from edgeslam_torch.synthetic.house.scene import Paint, Place, Scene
 
 CHAIR_M = 0.55
 """A desk's chair stands in the floor kept free before it, and is turned."""
@@ -47,6 +48,13 @@ def test_a_piece_is_turned_and_moved_as_a_whole(name):
     moved = np.array([there.point(p) for p in corners(one)])
     np.testing.assert_allclose(corners(other), moved, atol=1e-9)
     assert rngs[0].random() == rngs[1].random(), "painted alike"
+
+
+@pytest.mark.parametrize(("x", "free"), [(1.1, True), (1.0, False), (0.5, False), (4.4, True), (4.6, False)])
+def test_a_piece_fits_beside_another_and_within_the_room(x, free):
+    built = scene()
+    built.box(Place(0.0, 0.0, 0.0), (0.0, 0.5, 0.5), (1.0, 1.0, 1.0), Paint("metal"), "block")
+    assert fits(built, Place(x, 0.0, 0.0), 1.0, 0.5) is free
 
 
 def test_a_pile_of_books_stays_below_the_next_board():

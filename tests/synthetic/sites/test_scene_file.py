@@ -76,7 +76,7 @@ def test_unknown_names_and_negative_seeds_are_refused(name, seed):
 
 
 def test_a_scene_extends_another(scene):
-    file = read_scene(scene_path(scene("extends = 'l_corridor'\nwalls = ['bricks']\n[[rug]]\nx = 1\ny = 0\n")))
+    file = read_scene(scene_path(scene("extends = 'l_corridor'\nwalls = ['bricks']\n[[lamps]]\nx = 1\ny = 0\n")))
     base = read_scene(scene_path("l_corridor"))
-    assert (file.walls, len(file.rug)) == (("bricks",), 1)
-    assert (file.room, file.values, file.way) == (base.room, base.values, base.way)
+    assert (file.walls, file.lamps[-1].x) == (("bricks",), 1)
+    assert (file.room, file.values, file.lamps[:-1]) == (base.room, base.values, base.lamps)
