@@ -27,18 +27,12 @@ def table(tmp_path, text):
     return path
 
 
-def test_every_folder_and_video_of_a_folder_is_a_flight(recordings):
+def test_every_folder_and_video_of_a_folder_is_a_flight_and_same_names_are_numbered(recordings, tmp_path, write_images):
     assert names(recordings) == ["a", "b", "broken", "clip.mp4"]
-
-
-def test_same_names_are_numbered_also_where_only_their_case_differs(tmp_path, write_images):
-    for name in ("one/flight", "two/Flight", "three/flight"):
-        write_images(tmp_path / name, ["0.png"])
-    assert names(*(tmp_path / n / f for n, f in (("one", "flight"), ("two", "Flight"), ("three", "flight")))) == [
-        "flight",
-        "Flight-2",
-        "flight-3",
-    ]
+    places = [tmp_path / name for name in ("one/flight", "two/Flight", "three/flight")]  # their case differs
+    for place in places:
+        write_images(place, ["0.png"])
+    assert names(*places) == ["flight", "Flight-2", "flight-3"]
 
 
 def test_table_gives_each_flight_its_own_camera_truth_and_settings(tmp_path):

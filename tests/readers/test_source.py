@@ -73,6 +73,7 @@ def test_image_folder_in_numeric_order_at_30_hz(tmp_path, write_images):
     assert "guess" in source.camera.source
     assert source.camera.focal_sigma > 0.3
     assert "bends the trajectory" in source.warnings[0]
+    assert any("30 images/s" in problem.reason for problem in source.problems)
 
 
 @pytest.mark.parametrize(

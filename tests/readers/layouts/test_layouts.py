@@ -104,11 +104,6 @@ def test_names_may_be_nanoseconds(tmp_path, write_images, begin, prefix):
     assert np.allclose(np.diff([frame.stamp_s for frame in source.frames()]), 1 / 30, rtol=1e-3)
 
 
-def test_an_assumed_rate_is_said(tmp_path, write_images):
-    write_images(tmp_path, [f"img_{i:06d}.png" for i in range(4)])
-    assert any("30 images/s" in problem.reason for problem in open_source(tmp_path).problems)
-
-
 @pytest.mark.parametrize("rows", [["0.1"], ["a 0.1", "b 0.2"]])
 def test_times_that_do_not_fit_the_images_are_refused(tmp_path, write_images, rows):
     write_images(tmp_path / "images", [f"{i}.png" for i in range(4)])
