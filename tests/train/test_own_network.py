@@ -1,4 +1,4 @@
-"""A network that is not FastDepth learns from labels and from a run, and what it learnt flies as an ONNX file."""
+"""A network that is not FastDepth learns from labels, and what it learnt flies as an ONNX file."""
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ from edgeslam_torch.models.checkpoint import restored, save_checkpoint
 from edgeslam_torch.models.onnx.export import ExportOptions, export_onnx
 from edgeslam_torch.models.record import OTHER_NETWORK, Metadata
 from edgeslam_torch.models.trainable import DepthModule, Prediction
-from edgeslam_torch.train import Data, Existing, TrainConfig, finetune, load_depth_folder, load_run, out_folder
+from edgeslam_torch.train import Data, TrainConfig, finetune, load_depth_folder, out_folder
 from edgeslam_torch.train.validate import score
 
 METADATA = Metadata(
@@ -39,16 +39,12 @@ class Rows(DepthModule):
         return Prediction(line + self.layer(x), None)
 
 
-def taught(network, data, out):
-    with out_folder(out, Existing.SAME) as folder:
-        return finetune(network, METADATA, data, CONFIG, folder)
-
-
 def test_another_network_learns_from_labels_and_is_restored_from_the_best_file(tmp_path):
     labelled = load_depth_folder(write_folder(tmp_path / "hall"))
     torch.manual_seed(0)
     network = Rows()
-    outcome = taught(network, Data(labelled=[labelled]), tmp_path / "out")
+    with out_folder(tmp_path / "out") as out:
+        outcome = finetune(network, METADATA, Data(labelled=[labelled]), CONFIG, out)
     assert outcome.before is not None and outcome.kept is not None
     # A ramp from left to right has the same depth in all rows, and images are mirrored: the best rows are flat.
     assert outcome.kept.abs_rel_scaled < 0.6 * outcome.before.abs_rel_scaled
@@ -85,12 +81,3 @@ def test_tensors_of_another_network_are_refused(tmp_path):
         restored(nn.Conv2d(3, 1, 3), tmp_path / "w.safetensors")
     with pytest.raises(WeightsError, match="cannot read"):
         restored(Rows(), tmp_path / "none.safetensors")
-
-
-@pytest.mark.slow
-def test_another_network_learns_from_a_run_by_the_sweep(run_folder, tmp_path):
-    """Nothing but poses and map points: the network's own depth only fills what the sweep leaves open."""
-    torch.manual_seed(0)
-    outcome = taught(Rows(), Data(posed=[load_run(run_folder)]), tmp_path / "out")
-    assert outcome.before is not None and outcome.kept is not None
-    assert outcome.kept.abs_rel_scaled < 0.6 * outcome.before.abs_rel_scaled
