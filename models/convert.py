@@ -13,7 +13,7 @@ def read_upstream(path: Path, official: bool = False) -> tuple[dict[str, Array],
     metadata; data and licence are stated only if it comes from the ``official`` address.
 
     Raises:
-        WeightsError: If the file is damaged, refers to anything but tensors and modules, or holds no FastDepth.
+        WeightsError: If the file is damaged or holds no FastDepth.
     """
     with open_checkpoint(path) as checkpoint:
         metadata = upstream_metadata(checkpoint.state) if official else metadata_without_record(checkpoint.state, path)

@@ -57,11 +57,10 @@ class InertPickle(_Interpreter):
 
     Args:
         data: The block, of which the first `MAX_BYTES` are read.
-        allowed: Predicate for the names that a pickle may refer to.
     """
 
-    def __init__(self, data: bytes | mmap, allowed: Callable[[Name], bool]) -> None:
-        self._block, self._allowed = io.BytesIO(data[:MAX_BYTES]), allowed
+    def __init__(self, data: bytes | mmap) -> None:
+        self._block = io.BytesIO(data[:MAX_BYTES])
         super().__init__(self._block, encoding="utf-8", errors="surrogatepass")
         self.externals: list[External] = []
         """External references of all pickles so far."""
@@ -75,8 +74,7 @@ class InertPickle(_Interpreter):
         """The value of the next pickle.
 
         Raises:
-            WeightsError: If it is damaged, too long, refers to a name that is not allowed, or uses an instruction that
-                torch does not write.
+            WeightsError: If it is damaged, too long, or uses an instruction that torch does not write.
         """
         self.memo: dict[int, Any] = {}
         try:
@@ -88,12 +86,7 @@ class InertPickle(_Interpreter):
 
     def find_class(self, module: str, name: str) -> Name:
         """The name itself."""
-        found = Name(module, name)
-        if not self._allowed(found):
-            raise WeightsError(
-                f"checkpoint refers to {module[:80]}.{name[:80]}: refused, it may run code; nothing was run"
-            )
-        return found
+        return Name(module, name)
 
     def persistent_load(self, pid: Any) -> Any:
         """A reference, or the class that old torch wraps as ``("module", class, file, source)``."""

@@ -31,27 +31,6 @@ _KINDS = {
     "BoolStorage": ("BOOL", 1),
 }
 """Storage class: safetensors' name of its type, and bytes per number."""
-_NETWORKS = "MobileNet MobileNetSkipAdd MobileNetSkipConcat NNConv Identity"
-_ALLOWED = {
-    "torch": f"Size {' '.join(_KINDS)} device",
-    "torch._utils": "_rebuild_tensor _rebuild_tensor_v2 _rebuild_parameter",
-    "models": _NETWORKS,
-    "imagenet.mobilenet": _NETWORKS,
-    "__main__": _NETWORKS,
-    "collections": "OrderedDict defaultdict",
-    "builtins": "set dict",
-    "__builtin__": "set dict",
-    # Beside the model (arguments, epoch, best result, optimiser), unused:
-    "argparse": "Namespace",
-    "pathlib": "PosixPath WindowsPath",
-    "torch.torch_version": "TorchVersion",
-    "numpy": "dtype",
-    "numpy.core.multiarray": "scalar",
-    "numpy._core.multiarray": "scalar",
-    "_codecs": "encode",
-    "metrics": "Result",
-}
-"""Names by module, and all classes of layers and optimisers."""
 MAX_PARTS = 5000
 """Maximum modules and tensors of a network; FastDepth has 130 and 300, and a module may occur under several names."""
 MAX_DIRECTORY_BYTES = 1 << 20
@@ -95,8 +74,8 @@ def open_checkpoint(path: Path) -> Iterator[Checkpoint]:
     """The tensors of ``checkpoint['model']``, ``'state_dict'`` or ``'model_state_dict'``, a bare module or state dict.
 
     Raises:
-        WeightsError: If the file is missing or damaged, or refers to anything but tensors and modules; also from inside
-            the ``with``, with the file's name.
+        WeightsError: If the file is missing or damaged, or holds no network; also from inside the ``with``, with the
+            file's name.
     """
     with opened(path) as file:
         if file.seek(0, 2) == 0:
@@ -113,12 +92,6 @@ def is_zip(file: BinaryIO) -> bool:
     """Whether a file starts like torch's zip files."""
     file.seek(0)
     return file.read(4) == b"PK\x03\x04"
-
-
-def may_refer_to(name: Name) -> bool:
-    """Whether a network checkpoint may refer to a class or function."""
-    is_layer = name.module.startswith(("torch.nn.modules.", "torch.optim."))
-    return (is_layer and name.name.lstrip("_")[:1].isupper()) or name.name in _ALLOWED.get(name.module, "").split()
 
 
 class _Storage(NamedTuple):
@@ -139,7 +112,7 @@ class _ZipReader:
         if name is None:
             raise WeightsError("no data.pkl inside: not a torch file")
         self._folder = name.removesuffix("data.pkl")
-        self.content = InertPickle(self._read(name), may_refer_to).load()
+        self.content = InertPickle(self._read(name)).load()
 
     def bytes_of(self, storage: _Storage) -> bytes:
         """All bytes of a storage."""
@@ -162,7 +135,7 @@ class _LegacyReader:
 
     def __init__(self, data: mmap) -> None:
         self._data = data
-        reader = InertPickle(data, may_refer_to)
+        reader = InertPickle(data)
         if reader.load() != _LEGACY_MAGIC:
             raise WeightsError("not a torch checkpoint")
         if reader.load() != _LEGACY_PROTOCOL:

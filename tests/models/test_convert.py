@@ -61,12 +61,14 @@ class _Hostile:
 
 
 @pytest.mark.parametrize("zipped", [True, False])
-def test_hostile_pickle_is_refused_and_runs_nothing(tmp_path, zipped):
-    marker = tmp_path / "ran"
-    torch.save({"model": _Hostile(marker)}, tmp_path / "evil.pth", _use_new_zipfile_serialization=zipped)
-    with pytest.raises(WeightsError, match="refused"):
+def test_hostile_pickle_runs_nothing_beside_a_network_or_in_its_place(tmp_path, zipped):
+    marker, network = _Hostile(tmp_path / "ran"), FastDepth(Variant.PRUNED).state_dict()
+    torch.save({"model": network, "epoch": marker}, tmp_path / "evil.pth", _use_new_zipfile_serialization=zipped)
+    np.testing.assert_array_equal(read_upstream(tmp_path / "evil.pth")[0]["conv3.3.weight"], network["conv3.3.weight"])
+    torch.save({"model": marker}, tmp_path / "evil.pth", _use_new_zipfile_serialization=zipped)
+    with pytest.raises(WeightsError, match="no network"):
         read_upstream(tmp_path / "evil.pth")
-    assert not marker.exists()
+    assert not marker.marker.exists()
 
 
 @pytest.mark.filterwarnings("ignore:Couldn't retrieve source")

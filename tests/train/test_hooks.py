@@ -60,6 +60,7 @@ class Zero(Hooks):
     def on_losses(self, state, drawn):
         for name in list(drawn.losses):
             del drawn.losses[name]
+        drawn.losses["three"] = torch.full((len(drawn.batch["image"]),), 3.0)
         drawn.losses["own"] = (drawn.predicted.log_depth - 1.0).square().flatten(1).mean(1)
 
 
@@ -87,8 +88,9 @@ def test_own_loss_is_what_is_learnt_and_reported(tmp_path):
         def on_step(self, state, given):
             losses.append(given)
 
-    run(tmp_path, Zero(), Keep(), config=replace(CONFIG, steps=12, lr=0.05, batch=1))
-    assert [list(found) for found in losses] == [["supervised/own"]] * 12
+    run(tmp_path, Zero(), Keep(), config=replace(CONFIG, steps=12, lr=0.05))
+    assert [list(found) for found in losses] == [["supervised/three", "supervised/own"]] * 12
+    assert losses[0]["supervised/three"] == 3.0, "the mean over images"
     assert losses[-1]["supervised/own"] < 0.5 * losses[0]["supervised/own"]
 
 
