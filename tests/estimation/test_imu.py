@@ -12,7 +12,7 @@ from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.estimation.sensors.imu import Imu
 from edgeslam_torch.estimation.snapshot import Present
 from edgeslam_torch.imu import ImuModel, ImuReadings
-from edgeslam_torch.noise import VISUAL_MEMORY_S
+from edgeslam_torch.noise import IMU_YOUNG_S, VISUAL_MEMORY_S
 from edgeslam_torch.synthetic.flights.imu import ADIS16448, MPU6050, mounted, simulate_imu
 
 SCALE = 0.4
@@ -96,6 +96,20 @@ def test_the_scale_of_the_first_seconds_is_rough_and_says_so(seconds: float) -> 
             assert abs(found.log_scale - math.log(SCALE)) < 2.5 * found.sigma
 
 
+def test_a_map_that_bends_in_its_first_seconds_bends_no_scale() -> None:
+    model, off = mounted(ADIS16448, T_IMU_CAM), []
+    for seed in range(3):
+        seen = flight("free", model, seed)
+        step = np.diff(seen.T_m_c[:, :3, 3], axis=0)
+        step[seen.stamps_s[1:] - seen.stamps_s[0] < IMU_YOUNG_S] *= math.exp(0.3)
+        seen.T_m_c[1:, :3, 3] = seen.T_m_c[0, :3, 3] + np.cumsum(step, axis=0)
+        found = fitted(seen, model).scale
+        assert found is not None
+        off.append(found.log_scale - math.log(SCALE))
+    assert np.median(np.abs(off)) < 0.005
+    assert np.max(np.abs(off)) < 0.015
+
+
 @pytest.mark.parametrize(("motion", "kind"), [("static", "ADIS16448"), ("line", "MPU-6050")])
 def test_without_acceleration_there_is_no_scale(motion: str, kind: str) -> None:
     model = mounted(KINDS[kind], T_IMU_CAM)
@@ -159,6 +173,25 @@ FAULTS = {
     "accelerations, axes": lambda rate, felt, other: (rate, felt[:, [1, 2, 0]]),
     "accelerations, sign": lambda rate, felt, other: (rate, -felt),
 }
+
+
+def test_a_larger_reading_shows_that_the_range_did_not_end_there() -> None:
+    model = mounted(MPU6050, T_IMU_CAM)
+    seen = flight("free", model, 1)
+    t, rate = seen.readings.stamps_s, seen.readings.angular_rate_rad_s.copy()
+    half = t < t[len(t) // 2]
+    end = 0.5 * np.abs(rate[~half, 0]).max()
+    rate[half, 0] = rate[half, 0].clip(-end, end)  # as a slow sensor that repeats its largest reading
+    readings = ImuReadings(t, rate, seen.readings.acceleration_m_s2)
+    middle_s = t[len(t) // 2]
+    imu = Imu(model)
+    imu.add([readings.between(-math.inf, middle_s)])
+    early = seen.stamps_s < middle_s
+    imu.fit(seen.stamps_s[early], seen.T_m_c[early])
+    imu.add([readings.between(middle_s, math.inf)])
+    imu.fit(seen.stamps_s, seen.T_m_c)
+    fastest_s = t[~half][np.abs(rate[~half, 0]).argmax()]
+    assert imu.turned(fastest_s - 0.05, fastest_s + 0.05) is not None
 
 
 @pytest.mark.parametrize("fault", FAULTS)

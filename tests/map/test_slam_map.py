@@ -182,6 +182,14 @@ def test_frames_of_a_removed_keyframe_stay_in_their_submap(rng):
     np.testing.assert_allclose(points.map.pose_of(mine.id), before @ moved, atol=1e-12)
 
 
+def test_the_number_of_an_empty_submap_is_reused(rng):
+    points = PointMap(rng, 300, 2)
+    for begun in ("dark", "still dark"):
+        points.map.begin_piece(begun)
+        points.map.add_keyframe(points.keyframes[points.map.piece])
+    assert points.map.piece == 0
+
+
 def test_an_anchor_seen_at_a_coarse_level_is_seen_at_the_finest_from_farther_off(rng):
     """Level 3 of a pyramid of 1.2: the same patch fills level 0 at 1.728 times the distance."""
     points = PointMap(rng, 100, 2)

@@ -118,3 +118,9 @@ def test_without_an_image_nothing_is_aligned(seen):
     second.grey, first.grey = first.grey, None
     assert align(slam_map, second, CAMERA) == 0
     assert np.array_equal(second.features.uv, before) and np.isnan(second.aligned_px).all()
+
+
+def test_anchors_behind_a_view_are_not_aligned(seen):
+    slam_map, (first, second, third) = seen
+    slam_map.anchors.p_w[first.anchor] -= 10.0 * first.T_w_c[:3, 2]
+    assert align(slam_map, second, CAMERA) == align(slam_map, third, CAMERA) == 0

@@ -49,17 +49,6 @@ def test_consistent_points_of_two_keyframes_count_twice(points):
     assert (b.observations[:10] == 1).all()
 
 
-def test_points_behind_the_other_keyframe_do_not_count(points, rng):
-    p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:40]
-    a, b = host(points, 0, p_w), host(points, 1, p_w)
-    points.keyframes[1].T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ points.keyframes[1].T_c_w
-    edges = edge_map(points)
-    edges.add(b)
-    edges.add(a)
-    assert (a.observations == 1).all()
-    assert (b.observations == 1).all()
-
-
 def test_edge_points_move_with_their_keyframe(points, rng):
     p_w = points.world.p_w[points.world.visible[0]][:50]
     slow = edge_map(points, voxel=1e-6)
@@ -144,6 +133,21 @@ def test_keyframes_without_a_measured_edge_are_an_empty_map(points):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert edges.points().p_w.shape == (0, 3)
+
+
+def test_the_same_pixel_at_another_depth_is_another_edge(points):
+    """Measured by the second keyframe a fifth deeper along the first one's rays: same pixels there, another depth."""
+    p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:60]
+    centre = points.keyframes[0].centre_w
+    deeper = centre + 1.2 * (p_w - centre)
+    counts = []
+    for theirs in (p_w, deeper):
+        edges = edge_map(points)
+        edges.add(host(points, 1, theirs))
+        edges.add(host(points, 0, p_w))
+        counts.append((edges.hosts[1].observations == 2).mean())
+    assert counts[0] > 0.9
+    assert counts[1] < 0.1
 
 
 def followed(points, grown, on_prior=0):

@@ -19,9 +19,10 @@ from edgeslam_torch.tracking.initialiser import (
     Structure,
     from_essential_matrix,
     poses_between,
+    triangulated,
 )
 from edgeslam_torch.tracking.tracker import Tracker, make_view
-from edgeslam_torch.types import DepthMap, Frame
+from edgeslam_torch.types import DepthMap, Frame, FrameFeatures
 
 CONFIG = InitialisationConfig()
 
@@ -446,3 +447,24 @@ def test_an_adopted_predicted_map_keeps_its_matches(points):
         told = [point_of_anchor[a] for a in keyframe.anchor[held].tolist()]
         np.testing.assert_array_equal(told, points.point_of[view][held])
         assert np.abs(se3.log(keyframe.T_c_w @ se3.inverse(points.world.T_c_w[view]))).max() < 0.02
+
+
+def test_points_behind_the_second_camera_do_not_triangulate(rng):
+    """Half a metre forward; matches that meet between the two cameras fit every line, and lie behind the second."""
+    ahead = np.column_stack([rng.uniform(-1.5, 1.5, (120, 2)), rng.uniform(2.0, 6.0, 120)])
+    between = np.column_stack([rng.uniform(0.03, 0.12, (20, 2)), np.full(20, 0.25)])
+    p = np.concatenate([ahead, between])
+    forward = se3.exp(np.array([0.0, 0.0, -0.5, 0.0, 0.0, 0.0]))
+    bits = rng.integers(0, 256, (len(p), 32), dtype=np.uint8)
+    none = np.zeros(len(p), np.int32)
+    uv = [CAMERA.project(q).astype(np.float32) for q in (p, se3.transform(forward, p))]
+    features = [FrameFeatures(x, none, none.astype(np.float32), bits) for x in uv]
+    reference = make_keyframe(0, 0, 0.0, np.eye(4), features[0])
+    every = np.arange(len(p))
+    good = triangulated(Structure(forward, every, every, p), reference, np.deg2rad(0.75))
+    assert 90 < good.sum() < len(ahead)
+    assert not good[len(ahead) :].any()
+    guess = Structure(np.eye(4), every, every, np.concatenate([ahead, between * 30]))
+    found = from_essential_matrix(reference, guess, make_view(features[1], SCALE_FACTOR), CAMERA)
+    np.testing.assert_array_equal(found.p_w[len(ahead) :], guess.p_w[len(ahead) :])
+    assert (found.p_w[: len(ahead)] != ahead).any(1).sum() > 90
