@@ -13,6 +13,10 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.rotations import matrix_from_rpy, wrapped
 from edgeslam_torch.types import FloatArray
 
+STEP_S = 0.01
+"""Of the simulation."""
+SILENCE_LAND_S = 15.0
+"""A Tello lands by itself after this time without a command."""
 _HOVER_M = 0.8
 _GROUND_M = 0.1
 """Height of camera and range sensor when the drone stands on the floor."""

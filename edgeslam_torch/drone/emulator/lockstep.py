@@ -9,12 +9,8 @@ from typing import Literal
 import numpy as np
 
 from edgeslam_torch.drone.emulator.commands import Answer, Interpreter
-from edgeslam_torch.drone.emulator.drone import Contact, DroneModel, state_line
+from edgeslam_torch.drone.emulator.drone import SILENCE_LAND_S, STEP_S, Contact, DroneModel, state_line
 from edgeslam_torch.types import FloatArray
-
-_STEP_S = 0.01
-_SILENCE_LAND_S = 15.0
-"""A Tello lands by itself after this time without a command."""
 
 Channel = Literal["command", "state", "video"]
 
@@ -124,9 +120,9 @@ class LockstepTello:
             raise ValueError(f"a step must be longer than 0 s and shorter than an hour, got {seconds} s")
         until_s = self.clock_s + seconds
         arrived: list[Event] = []
-        while (self._steps + 1) * _STEP_S <= until_s + 1e-9:
+        while (self._steps + 1) * STEP_S <= until_s + 1e-9:
             self._steps += 1
-            self.clock_s = self._steps * _STEP_S
+            self.clock_s = self._steps * STEP_S
             arrived += self._step()
         self.clock_s = until_s
         return arrived
@@ -140,9 +136,9 @@ class LockstepTello:
             else:
                 out.append(item)  # type: ignore[arg-type]
         touched = len(self.drone.contacts)
-        self.drone.step(_STEP_S)
+        self.drone.step(STEP_S)
         out += self.drone.contacts[touched:]
-        if self.drone.flying and self.clock_s - self._last_command_s > _SILENCE_LAND_S:
+        if self.drone.flying and self.clock_s - self._last_command_s > SILENCE_LAND_S:
             self.drone.land()
         if self._pending and not self.drone.busy:
             for text in self._pending:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.drone.emulator.commands import Answer, Interpreter
-from edgeslam_torch.drone.emulator.drone import DroneModel, state_line
+from edgeslam_torch.drone.emulator.drone import SILENCE_LAND_S, STEP_S, DroneModel, state_line
 from edgeslam_torch.drone.emulator.encoder import Encoder
 from edgeslam_torch.drone.emulator.link import Link, LinkFaults
 from edgeslam_torch.drone.emulator.stopwatch import draw_time
@@ -23,9 +23,7 @@ logger = logging.getLogger(__name__)
 Render = Callable[[FloatArray], np.ndarray]
 """Picture (H, W, 3) BGR that the drone's camera sees with its body at ``T_w_b`` (4, 4)."""
 
-_STEP_S = 0.01
 _STATE_S = 0.1
-_SILENCE_LAND_S = 15.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +134,10 @@ class TelloEmulator:
         while not self._stopping.is_set():
             now = time.monotonic()
             with self._lock:
-                while begin + steps * _STEP_S < now:
-                    self.drone.step(_STEP_S)
+                while begin + steps * STEP_S < now:
+                    self.drone.step(STEP_S)
                     steps += 1
-                if self.drone.flying and now - self._last_command_s > _SILENCE_LAND_S:
+                if self.drone.flying and now - self._last_command_s > SILENCE_LAND_S:
                     self.drone.land()
                 done = [] if self.drone.busy else self._pending
                 self._pending = self._pending[len(done) :]
@@ -153,7 +151,7 @@ class TelloEmulator:
                     self.link.send(self._socket, line.encode("ascii"), to, self.config.link.latency_s)
             if now >= next_state:
                 next_state += _STATE_S * max(1, math.ceil((now - next_state) / _STATE_S))
-            self._stopping.wait(_STEP_S)
+            self._stopping.wait(STEP_S)
 
     def _paint(self) -> None:
         """Render at each tick, or as fast as possible; `_stream` encodes concurrently."""
