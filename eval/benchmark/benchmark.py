@@ -252,17 +252,12 @@ def _one_line(key: Key, run: dict[str, Any]) -> str:
     return text + (f", {f['cpu_ms_per_frame']:.0f} ms CPU per frame" if f.get("cpu_ms_per_frame") else "")
 
 
-def read_peers(path: Path = _PEERS) -> list[dict[str, Any]]:
-    """Stored figures of other systems, each with its source and conditions."""
-    return list(tomllib.loads(path.read_text(encoding="utf-8"))["peer"])
-
-
 def markdown_bench(record: dict[str, Any]) -> str:
     """One table a sequence: every run, their median, and the peers' figures."""
-    parts = [_conditions(record)]
+    parts, published = [_conditions(record)], tomllib.loads(_PEERS.read_text(encoding="utf-8"))["peer"]
     for name, runs in grouped(record["runs"], "sequence").items():
-        peers = [p for p in read_peers() if p["sequence"].startswith(name) or p["sequence"].split()[0] in name]
-        used = [f for f in FIGURES if f.values(runs) or any(_published(p, f) is not None for p in peers)]
+        peers = [p for p in published if p["sequence"].startswith(name) or p["sequence"].split()[0] in name]
+        used = [f for f in FIGURES if f.values(runs) or any(_of_peer(p, f) for p in peers)]
         lines = [[f"edgeslam, seed {run['seed']}", *(f.cell(f.values([run])) for f in used)] for run in runs]
         if len(runs) > 1:
             lines.append([f"**edgeslam, median of {len(runs)}**", *(f.cell(f.values(runs)) for f in used)])
@@ -270,7 +265,12 @@ def markdown_bench(record: dict[str, Any]) -> str:
             lines.append(["its noise: two of these differ by less (±)", *noise])
         for k, peer in enumerate(peers, start=1):
             where = "" if peer["sequence"] == name else f", {peer['sequence']}"
-            lines.append([f"{peer['system']}{where} [{k}]", *(_peer_cell(peer, f) for f in used)])
+            lines.append(
+                [
+                    f"{peer['system']}{where} [{k}]",
+                    *(" ".join(map(f.cell, ([v] for v in _of_peer(peer, f)))) or "-" for f in used),
+                ]
+            )
         parts += ["", f"### {name}", "", markdown_table(["system", *(f.title for f in used)], lines)]
         errors = [f"- seed {run['seed']} failed: {run['error']}" for run in runs if run.get("error")]
         notes = [f"[{k}] {p['source']}; {p['conditions']}" for k, p in enumerate(peers, start=1)]
@@ -282,15 +282,10 @@ def markdown_bench(record: dict[str, Any]) -> str:
     return "\n".join(parts) + "\n"
 
 
-def _published(peer: dict[str, Any], figure: Figure) -> Any:
-    return peer.get("ate_m" if figure.name == "ate_sim3_m" else figure.name)
-
-
-def _peer_cell(peer: dict[str, Any], figure: Figure) -> str:
-    """Every value of a figure, of which a peer may have a list."""
-    found = _published(peer, figure)
-    values = found if isinstance(found, list) else [found]
-    return " ".join(figure.cell([value]) for value in values)
+def _of_peer(peer: dict[str, Any], figure: Figure) -> list[float]:
+    """Published values of a figure, of which a peer may have several."""
+    found = peer.get("ate_m" if figure.name == "ate_sim3_m" else figure.name, [])
+    return found if isinstance(found, list) else [found]
 
 
 def _conditions(record: dict[str, Any]) -> str:

@@ -22,8 +22,6 @@ _CONDITIONS = ("machine", "seeds", "mode", "max_frames", "overrides")
 
 Run = dict[str, Any]
 """A run, with its ``figures`` by name; None where it has none."""
-Groups = Mapping[str, Sequence[Run]]
-"""Runs of one source with several seeds, by the source's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +61,8 @@ class Figure:
 
     def noise(self, before: Sequence[float], after: Sequence[float]) -> float:
         """Difference of the medians of two sets of values that means nothing."""
-        by_chance = _SIGMAS * float(np.sqrt(sum(_scatter(values) ** 2 / len(values) for values in (before, after))))
+        variances = [np.var(values, ddof=1) / len(values) for values in (before, after) if len(values) > 1]
+        by_chance = _SIGMAS * float(np.sqrt(sum(variances)))
         floor = self.one_seed if self.one_seed is not None and min(len(before), len(after)) == 1 else self.floor
         return max(by_chance, (floor or 0.0) * (abs(float(np.median(before))) if self.relative else 1.0))
 
@@ -82,11 +81,6 @@ class Figure:
         return self.verdict(a, b) if b else "worse"  # what there is no more is worse
 
 
-def _scatter(values: Sequence[float]) -> float:
-    """Sample standard deviation; 0 of a single value."""
-    return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
-
-
 def plain(figures: Mapping[str, Any]) -> dict[str, float | None]:
     """For JSON: numbers, and None for what is missing or not finite."""
     return {name: float(v) if v is not None and np.isfinite(v) else None for name, v in figures.items()}
@@ -97,41 +91,43 @@ def grouped(runs: Sequence[Run], key: str) -> dict[str, list[Run]]:
     return {name: [run for run in runs if run[key] == name] for name in dict.fromkeys(run[key] for run in runs)}
 
 
-def markdown_comparison(before: Groups, after: Groups, figures: Sequence[Figure]) -> str:
-    """Medians of both and their ratio, a line for every name, ``!`` where it got worse and ``+`` where better."""
-    compared = [figure for figure in figures if figure.floor is not None]
-    names = [name for name in after if name in before]
-    worse = []
-    lines = []
+def compared(
+    before: Mapping[str, Any], after: Mapping[str, Any], rows: str, key: str, figures: Sequence[Figure]
+) -> str:
+    """Two records side by side: medians and their ratio, a line for every source, and what to beware of.
+
+    Args:
+        before: A record.
+        after: Another one.
+        rows: Key of a record's runs.
+        key: Of a run's source.
+        figures: Compared where they have a floor.
+    """
+    head = f"{before.get('commit')} -> {after.get('commit')}, medians, ratio; ! worse, + better by more than the noise"
+    old, new = grouped(before[rows], key), grouped(after[rows], key)
+    names, figures = [name for name in new if name in old], [figure for figure in figures if figure.floor is not None]
+    worse, lines = [], []
     for name in names:
         line = [name]
-        for figure in compared:
-            a, b = figure.values(before[name]), figure.values(after[name])
+        for figure in figures:
+            a, b = figure.values(old[name]), figure.values(new[name])
             first, second = (float(np.median(values)) if values else 0.0 for values in (a, b))
             ratio = f" x{second / first:.2f}" if figure.relative and b and first > 0 else ""
-            verdict = figure.change(before[name], after[name])
+            verdict = figure.change(old[name], new[name])
             mark = {"worse": " !", "better": " +"}.get(verdict, "")
             line.append(f"{figure.cell(a)} -> {figure.cell(b)}{ratio}{mark}" if a or b else "-")
             if verdict == "worse":
                 worse.append(f"{name} {figure.title}{ratio if b else ' (none any more)'}")
         lines.append(line)
-    text = [markdown_table(["runs of", *(figure.title for figure in compared)], lines), ""]
-    missing = sorted(before.keys() ^ after.keys())
+    text = [head, *_other_conditions(before, after), ""]
+    text += [markdown_table(["runs of", *(figure.title for figure in figures)], lines), ""]
+    missing = sorted(old.keys() ^ new.keys())
     named = ", ".join(missing) if len(missing) <= _MOST_NAMED else f"{len(missing)} names"
     text += [f"only in one of the two: {named}"] if missing else []
     text += [f"worse: {', '.join(worse) if worse else 'nothing'}"]
-    if any(len(runs) == 1 for name in names for runs in (before[name], after[name])):
+    if any(len(runs[name]) == 1 for name in names for runs in (old, new)):
         text += ["with one seed the scatter is not known: only the floors of the figures are applied"]
     return "\n".join(text) + "\n"
-
-
-def compared(
-    before: Mapping[str, Any], after: Mapping[str, Any], rows: str, name: str, figures: Sequence[Figure]
-) -> str:
-    """Two records side by side, and what to beware of; ``rows`` is the key of the runs, ``name`` of a run's source."""
-    head = f"{before.get('commit')} -> {after.get('commit')}, medians, ratio; ! worse, + better by more than the noise"
-    table = markdown_comparison(grouped(before[rows], name), grouped(after[rows], name), figures)
-    return "\n".join([head, *other_conditions(before, after), "", table])
 
 
 def read_record(path: Path, command: str, formats: Container[int], rows: str) -> dict[str, Any]:
@@ -148,7 +144,7 @@ def read_record(path: Path, command: str, formats: Container[int], rows: str) ->
     return record
 
 
-def other_conditions(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
+def _other_conditions(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
     """What two records differ in beside their runs, one line each."""
     lines = []
     for key in (key for key in _CONDITIONS if key in before and key in after):

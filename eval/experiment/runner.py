@@ -9,13 +9,13 @@ A case's folder holds ``case.json`` (what to do), ``log.txt`` and ``result.json`
 import importlib
 import json
 import os
-import subprocess
 import sys
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import Any, TypeVar
 
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.errors import EvaluationError
@@ -94,11 +94,6 @@ Runner = Callable[[Iterable[Any], Callable[[Any], Path]], Generator[tuple[Any, E
 they come; closing it ends what still runs."""
 
 
-def start_case(folder: Path, log: IO[str]) -> subprocess.Popen[str]:
-    """The process of a case's folder."""
-    return start_module(MODULE, folder, log)
-
-
 @dataclass(frozen=True, slots=True)
 class Local:
     """Runs cases on this machine, each in a process of its own on one thread."""
@@ -107,7 +102,7 @@ class Local:
     limits: Limits
     retries: int = 0
     """Repetitions after a process was killed from outside."""
-    start: Start = start_case
+    start: Start = partial(start_module, MODULE)
 
     def __call__(self, cases: Iterable[T], prepare: Callable[[T], Path]) -> Generator[tuple[T, Ended]]:
         """See `Runner`."""

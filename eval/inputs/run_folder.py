@@ -114,13 +114,13 @@ def open_run(path: Path | str) -> RunFolder:
         return RunFolder(path, read_trajectory(path), None, (), {})
     if not path.exists():
         raise EvaluationError(f"{path}: no such run folder or trajectory file")
-    online = path / "trajectory_online.txt"
+    online, summary = path / "trajectory_online.txt", path / "summary.json"
     return RunFolder(
         path,
         read_trajectory(path),
         read_trajectory(online) if online.is_file() else None,
         read_status(path / "status.csv"),
-        read_summary(path / "summary.json"),
+        read_mapping(summary, "JSON", EvaluationError) if summary.is_file() else {},
     )
 
 
@@ -163,12 +163,3 @@ def read_status(path: Path) -> tuple[dict[str, str], ...]:
     except (ValueError, csv.Error) as error:
         raise EvaluationError(f"{path}: not the table of a run ({error})") from error
     return rows
-
-
-def read_summary(path: Path) -> dict[str, Any]:
-    """``summary.json``; empty when there is none.
-
-    Raises:
-        EvaluationError: If it is not a JSON object.
-    """
-    return read_mapping(path, "JSON", EvaluationError) if path.is_file() else {}

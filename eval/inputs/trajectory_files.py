@@ -255,8 +255,7 @@ def _from_kitti(table: FloatArray, path: Path, stamps_s: FloatArray | None) -> T
     notes: list[str] = []
     if stamps_s is None:
         sequence = path.parent.parent / "sequences" / path.stem / _TIMES  # of poses/00.txt, as KITTI has them
-        times = next((file for file in (path.with_name(_TIMES), sequence) if file.is_file()), None)
-        stamps_s = None if times is None else seconds_of(_read_table(times).numbers([0])[:, 0])[0]
+        stamps_s = _stamps_beside(path.with_name(_TIMES), sequence)
     stamped = stamps_s is not None
     if stamps_s is None:
         notes.append("no times.txt beside the KITTI poses: rows are matched by number, at 10 Hz")
@@ -269,6 +268,12 @@ def _from_kitti(table: FloatArray, path: Path, stamps_s: FloatArray | None) -> T
     return replace(found, numbered="" if stamped else ROWS)
 
 
+def _stamps_beside(*places: Path) -> FloatArray | None:
+    """Stamps [s] of the first of these files that is there."""
+    times = next((file for file in places if file.is_file()), None)
+    return None if times is None else seconds_of(_read_table(times).numbers([0])[:, 0])[0]
+
+
 def _from_seven_scenes(files: list[Path], folder: Path) -> Trajectory:
     numbers = np.array([int("".join(c for c in file.name.split(".")[0] if c.isdigit()) or -1) for file in files])
     T = np.empty((len(files), 4, 4))
@@ -277,8 +282,8 @@ def _from_seven_scenes(files: list[Path], folder: Path) -> Trajectory:
         if table.shape != (4, 4):
             raise EvaluationError(f"{file}: a 7-Scenes pose is 4x4 numbers, got {table.shape[0]}x{table.shape[1]}")
         T[i] = table
-    if (folder / _TIMES).is_file():
-        stamps_s = seconds_of(_read_table(folder / _TIMES).numbers([0])[:, 0])[0]
+    stamps_s = _stamps_beside(folder / _TIMES)
+    if stamps_s is not None:
         if len(stamps_s) != len(files):
             raise EvaluationError(f"{folder}: {len(files)} poses but {len(stamps_s)} stamps in {_TIMES}")
         return _from_matrices(stamps_s, T, str(folder), [])

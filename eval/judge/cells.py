@@ -97,11 +97,6 @@ class Cell:
         """Name of the cell that this one is a variant of; its own when it is none."""
         return self.name.rpartition("/")[0] if self.variant else self.name
 
-    @property
-    def slug(self) -> str:
-        """Name of its folder."""
-        return f"{self.name.replace('/', '__')}-s{self.seed}"
-
 
 def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequence[str] = ()) -> list[Cell]:
     """Cells of a set, seed by seed within a name.

@@ -68,7 +68,8 @@ def judge(
     def task(cell: Cell) -> Task:
         case = {"commit": commit, **how, "cell": asdict(cell)}
         run = "edgeslam_torch.eval.judge.run_cell:run_cell"
-        return Task(out / CELLS, cell.slug, run, case, {"flights": str(flights)})
+        own = f"{cell.name.replace('/', '__')}-s{cell.seed}"
+        return Task(out / CELLS, own, run, case, {"flights": str(flights)})
 
     runner = runner or Local(settings.jobs, Limits(settings.timeout_s))
     rows = run_all({cell: task(cell) for cell in cells}, runner, _row, _one_line, say)

@@ -48,27 +48,21 @@ def _unknown(grade: ImuModel) -> Callable[[Drawn], Simulated]:
     return make
 
 
-def _gaps(drawn: Drawn) -> Simulated:
-    model, readings = simulated(drawn, MPU6050)
-    t = readings.stamps_s
-    starts = np.linspace(t[0], t[-1], _GAPS + 2)[1:-1]
-    return model, _rows(readings, np.all((t[:, None] < starts) | (t[:, None] >= starts + _GAP_S), axis=1))
-
-
-def _turned(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Drawn], Simulated]:
-    """Angular rates changed by a function."""
+def _spoilt(change: Callable[[ImuReadings], ImuReadings]) -> Callable[[Drawn], Simulated]:
+    """Correct readings, changed by a function."""
 
     def make(drawn: Drawn) -> Simulated:
         model, readings = simulated(drawn, MPU6050)
-        return model, replace(readings, angular_rate_rad_s=change(readings.angular_rate_rad_s))
+        return model, change(readings)
 
     return make
 
 
-def _permuted(drawn: Drawn) -> Simulated:
-    model, readings = simulated(drawn, MPU6050)
-    rate, force = readings.angular_rate_rad_s[:, [1, 2, 0]], readings.acceleration_m_s2[:, [1, 2, 0]]
-    return model, ImuReadings(readings.stamps_s, rate, force)
+def _with_gaps(readings: ImuReadings) -> ImuReadings:
+    t = readings.stamps_s
+    starts = np.linspace(t[0], t[-1], _GAPS + 2)[1:-1]
+    kept = np.all((t[:, None] < starts) | (t[:, None] >= starts + _GAP_S), axis=1)
+    return ImuReadings(t[kept], readings.angular_rate_rad_s[kept], readings.acceleration_m_s2[kept])
 
 
 def _other_flight(drawn: Drawn) -> Simulated:
@@ -78,19 +72,17 @@ def _other_flight(drawn: Drawn) -> Simulated:
     return model, simulate_imu(rng, flight.stamps_s + drawn.stamps_s[0], flight.T_w_c, model)
 
 
-def _rows(readings: ImuReadings, kept: np.ndarray) -> ImuReadings:
-    return ImuReadings(readings.stamps_s[kept], readings.angular_rate_rad_s[kept], readings.acceleration_m_s2[kept])
-
-
 IMU_KINDS: dict[str, Callable[[Drawn], Simulated]] = {
     "adis16448": lambda drawn: simulated(drawn, ADIS16448),
     "mpu6050": lambda drawn: simulated(drawn, MPU6050),
     "adis16448_unknown": _unknown(ADIS16448),
     "mpu6050_unknown": _unknown(MPU6050),
-    "gaps": _gaps,
+    "gaps": _spoilt(_with_gaps),
     "clipped": lambda drawn: simulated(drawn, MPU6050, errors=_RANGE),
-    "degrees": _turned(np.degrees),
-    "permuted": _permuted,
+    "degrees": _spoilt(lambda r: replace(r, angular_rate_rad_s=np.degrees(r.angular_rate_rad_s))),
+    "permuted": _spoilt(
+        lambda r: ImuReadings(r.stamps_s, r.angular_rate_rad_s[:, [1, 2, 0]], r.acceleration_m_s2[:, [1, 2, 0]])
+    ),
     "other_flight": _other_flight,
 }
 """By the name in a cell's name; the first four are correct."""

@@ -80,16 +80,6 @@ def _frozen(drawn: Drawn) -> Samples:
     return [replace(stuck, stamp_s=s.stamp_s) if start <= s.stamp_s < end else s for s in samples]
 
 
-def _stamped(change: Callable[[float, float], float]) -> Callable[[Drawn], Samples]:
-    """Stamps changed by a function of stamp and first stamp."""
-
-    def make(drawn: Drawn) -> Samples:
-        samples = _rounded(drawn)
-        return [replace(s, stamp_s=change(s.stamp_s, samples[0].stamp_s)) for s in samples]
-
-    return make
-
-
 def _other_flight(drawn: Drawn) -> Samples:
     """Telemetry of a simulated flight through a room."""
     seconds = float(drawn.stamps_s[-1] - drawn.stamps_s[0]) + 1.0
@@ -110,30 +100,28 @@ def _random_velocities(drawn: Drawn) -> Samples:
     return [replace(s, velocity_m_s=v, **none) for s, v in zip(samples, velocity, strict=True)]  # type: ignore[arg-type]
 
 
-def _to_centimetres(velocity_dm_s: FloatArray) -> FloatArray:
+def _fine(velocity_dm_s: FloatArray) -> FloatArray:
     return 0.1 * np.rint(10.0 * velocity_dm_s)
-
-
-def _centimetres(drawn: Drawn) -> Samples:
-    """Velocities in cm/s, read as dm/s."""
-    return [replace(s, velocity_m_s=10.0 * s.velocity_m_s) for s in _rounded(drawn, _to_centimetres)]
 
 
 def _body(drawn: Drawn) -> Samples:
     """Velocities in body axes, declared to be in the world of power-on."""
     return [
         replace(s, velocity_m_s=0.1 * np.rint(10.0 * matrix_from_rpy(s.rpy_rad).T @ s.velocity_m_s))
-        for s in _rounded(drawn, _to_centimetres)
+        for s in _rounded(drawn, _fine)
     ]
 
 
 def _spoilt(
-    fields: Sequence[str], change: Callable[[FloatArray], FloatArray], axis: int | None = None
+    fields: Sequence[str],
+    change: Callable[[FloatArray], FloatArray],
+    axis: int | None = None,
+    velocities: Callable[[FloatArray], FloatArray] = np.rint,
 ) -> Callable[[Drawn], Samples]:
     """Correct telemetry except for some fields, or one axis of a field, changed by a function."""
 
     def make(drawn: Drawn) -> Samples:
-        samples = _rounded(drawn)
+        samples = _rounded(drawn, velocities)
         for name in fields:
             values = np.array([getattr(s, name) for s in samples])
             where = slice(None) if axis is None else (slice(None), axis)
@@ -160,12 +148,12 @@ KINDS: dict[str, Callable[[Drawn], Samples]] = {
     "truncated": lambda drawn: _rounded(drawn, np.trunc),
     "off": _off,
     "frozen": _frozen,
-    "late": _stamped(lambda stamp, _: stamp + OFF_S),
-    "early": _stamped(lambda stamp, _: stamp - OFF_S),
-    "doubled": _stamped(lambda stamp, first: first + 2.0 * (stamp - first)),
+    "late": _spoilt(["stamp_s"], lambda t: t + OFF_S),
+    "early": _spoilt(["stamp_s"], lambda t: t - OFF_S),
+    "doubled": _spoilt(["stamp_s"], lambda t: t[0] + 2.0 * (t - t[0])),
     "other_flight": _other_flight,
     "random": _random_velocities,
-    "centimetres": _centimetres,
+    "centimetres": _spoilt(["velocity_m_s"], lambda v: 10.0 * v, velocities=_fine),
     "body": _body,
     "attitude_missing": _spoilt(["rpy_rad"], lambda column: np.full_like(column, np.nan)),
     "roll_mirrored": _spoilt(["rpy_rad"], np.negative, 0),

@@ -37,6 +37,7 @@ _ESTIMATE, _TRUTH, _BOTH = "the estimate's", "the ground truth's", "both files'"
 _EITHER = "one file's (undecidable which)"
 
 _MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
+_BACKWARDS = "the poses run backwards in time against their stamps"
 _MIRRORED = "the positions are mirrored: in one file two axes are swapped, one negated, or its world is left-handed"
 _INVERSE = "poses look like world-to-camera; a trajectory must hold camera-to-world (their inverse)"
 _INVERTED = "orientations look inverted (world-to-camera rotation with camera-to-world positions)"
@@ -72,7 +73,10 @@ def explain(
         few = f"only {score.matched} poses have ground truth: an alignment fits almost anything to so few"
         return [*notes, few]
     estimate = replace(estimate, stamps_s=estimate.stamps_s + score.offset_s)
-    notes += _match_notes(truth, estimate, score)
+    possible = possible_pairs(truth.stamps_s, estimate.stamps_s)
+    if score.matched < 0.5 * possible:
+        few = f"only {score.matched} of {possible} poses found a partner in time"
+        notes.append(f"{few}: a larger --max-dt, or --offset?")
     notes += _scale_notes(score)
     if score.alignment.degenerate:
         notes.append("the motion is along a line: rotation about it is not determined, judge translation only")
@@ -91,14 +95,6 @@ def explain(
         mirrored = _misfit(truth, replace(estimate, T_w_c=_MIRROR @ estimate.T_w_c), max_dt_s)
         found = [_MIRRORED] if mirrored < _BETTER * shape else found
     return notes + found
-
-
-def _match_notes(truth: Trajectory, estimate: Trajectory, score: TrajectoryScore) -> list[str]:
-    """Fewer pairs than there could be."""
-    possible = possible_pairs(truth.stamps_s, estimate.stamps_s)
-    if score.matched < 0.5 * possible:
-        return [f"only {score.matched} of {possible} poses found a partner in time: a larger --max-dt, or --offset?"]
-    return []
 
 
 def _scale_notes(score: TrajectoryScore) -> list[str]:
@@ -132,12 +128,7 @@ def _shape_notes(
         if estimate.oriented or whose == _TRUTH
     ]
     undone += [
-        (
-            "",
-            "the poses run backwards in time against their stamps",
-            truth,
-            replace(estimate, T_w_c=estimate.T_w_c[::-1]),
-        ),
+        ("", _BACKWARDS, truth, replace(estimate, T_w_c=estimate.T_w_c[::-1])),
         ("", _MIRRORED, truth, replace(estimate, T_w_c=_MIRROR @ estimate.T_w_c)),
     ]
     suspects = [_Suspect(whose, mistake, _misfit(t, e, max_dt_s)) for whose, mistake, t, e in undone]

@@ -270,7 +270,8 @@ def score_map(
         tree = search_tree(p)
         gap, _ = tree.query(truth.edges_w, distance_upper_bound=1.01 * max(thresholds_m))
         completeness = {t: float(np.mean(gap <= t)) for t in thresholds_m}
-        f_score = {t: _harmonic(accuracy[t], completeness[t]) for t in thresholds_m}
+        sums = {t: accuracy[t] + completeness[t] for t in thresholds_m}
+        f_score = {t: 2.0 * accuracy[t] * completeness[t] / both if both > 0 else 0.0 for t, both in sums.items()}
     return MapScore(
         points=len(p_w),
         judged_share=float(seen.mean()),
@@ -299,7 +300,3 @@ def _median_after_icp(p: FloatArray, tree: "cKDTree") -> float:
         except EvaluationError:  # all in one place: no shape to align
             return float("nan")
     return float(np.median(tree.query(p)[0]))
-
-
-def _harmonic(a: float, b: float) -> float:
-    return 2.0 * a * b / (a + b) if a + b > 0 else 0.0

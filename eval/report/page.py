@@ -92,7 +92,7 @@ def render(run: RunFolder, score: RunScore | None = None) -> str:
     anchors = _subset(run.cloud("anchors.ply"), _MAX_ANCHORS)
     turn = upright(run.trajectory, score) if run.up == "unknown" else np.eye(3)
     data, packed_edges, packed_anchors = _payload(run, edges, anchors, score, turn)
-    text = json.dumps(finite(data), allow_nan=False, separators=(",", ":"), default=_plain).replace("<", "\\u003c")
+    text = json.dumps(finite(data), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     script = "\n".join((TEMPLATE / name).read_text(encoding="utf-8") for name in _SCRIPTS)
     parts = {
         "style": (TEMPLATE / "style.css").read_text(encoding="utf-8"),
@@ -398,9 +398,3 @@ def _jpeg(image: np.ndarray) -> str:
 
 def _rounded(values: FloatArray, digits: int) -> list[Any]:
     return list(np.round(np.asarray(values, dtype=np.float64), digits).tolist())
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, np.generic):
-        return value.item()
-    return str(value)

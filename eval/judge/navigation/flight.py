@@ -65,7 +65,8 @@ def fly(case: Case) -> Flown:
     tasks = _Tasks(site, behaviour, FlightController(limits), conditions.scale)
     found = Flown(case)
     if case.behaviour == "goto":
-        found.oracle_s = _take_off_s(limits) + shortest_m(site, limits) / limits.speed_m_s
+        take_off_s = 2.5 + (limits.height_m - 0.9) / limits.climb_m_s  # of itself to 0.8 m, then the planner's climb
+        found.oracle_s = take_off_s + shortest_m(site, limits) / limits.speed_m_s
     _sum_up(found, site, drone, _fly(tello, perception, tasks, conditions, found), behaviour)
     known = tasks.flight_controller.exits()
     found.exits = [len(site.exits), len(known), right_exits(known, site)]
@@ -210,8 +211,3 @@ def shortest_m(site: Site, limits: NavLimits) -> float:
     plan = cost_to_go(layer, layer.cells(site.goal_w[None, :2]), need_m, need_m, layer.cells(start))
     way = plan.way(start, 100.0)
     return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()) if np.isfinite(plan.at(start)) else float("inf")
-
-
-def _take_off_s(limits: NavLimits) -> float:
-    """Duration of the drone's take-off to 0.8 m and of the climb to the flight height."""
-    return 2.5 + (limits.height_m - 0.9) / limits.climb_m_s

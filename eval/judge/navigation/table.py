@@ -19,15 +19,8 @@ TABLE, FLIGHTS = "navigation.md", "flights"
 FAILED = "failed"
 """Prefix of the ending of a flight that raised an error."""
 _TIMEOUT_S = 3600.0
-HEAD = (
-    "world", "behaviour", "fault", "perception", "flights", "reached", "contact", "no contact and landed on the floor",
-    "clearance p5, min [m]", "time over oracle", "cruise [m/s]", "CPU a tick, worst [ms]",
-)  # fmt: skip
-OFF_HEAD = (
-    "perception", "ticks with metric scale", "pose error more than 0.1 m beyond three sigmas", "flights with any",
-    "maximum error, median and worst [m]",
-)  # fmt: skip
-EXITS_HEAD = ("behaviour", "perception", "exits there", "found", "precision", "recall")
+Line = dict[str, str]
+"""Of a table, by the columns' titles."""
 
 
 def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[str], None]) -> list[Flown]:
@@ -101,11 +94,11 @@ def markdown(flights: Sequence[Flown]) -> str:
             rows.append(_row((*names, *kinds), group))
     exits = [_exits_row(key, group) for key, group in _grouped(flights, "perception", "behaviour").items()]
     off = [_off_row(name, [f for f in group if f.off[0]]) for (name,), group in _grouped(flights, "perception").items()]
-    text = markdown_table(HEAD, rows) + "\n"
-    for head, lines in ((EXITS_HEAD, exits), (OFF_HEAD, off)):
-        known = [line for line in lines if line]
-        text += f"\n{markdown_table(head, known)}\n" if known else ""
-    return text
+    tables = [known for lines in (rows, exits, off) if (known := [[*line.items()] for line in lines if line])]
+    return "\n".join(
+        markdown_table([title for title, _ in lines[0]], [[cell for _, cell in line] for line in lines]) + "\n"
+        for lines in tables
+    )
 
 
 def _grouped(flights: Sequence[Flown], *names: str) -> dict[tuple[str, ...], list[Flown]]:
@@ -115,39 +108,47 @@ def _grouped(flights: Sequence[Flown], *names: str) -> dict[tuple[str, ...], lis
     return dict(sorted(groups.items()))
 
 
-def _exits_row(names: tuple[str, ...], group: Sequence[Flown]) -> list[str]:
+def _exits_row(names: tuple[str, ...], group: Sequence[Flown]) -> Line:
     there, found, right = np.sum([f.exits for f in group], axis=0).tolist()
     if not there and not found:
-        return []
-    return [names[1], names[0], f"{there}", f"{found}", _share(right, found), _share(right, there)]
+        return {}
+    shares = {"precision": _share(right, found), "recall": _share(right, there)}
+    return {"behaviour": names[1], "perception": names[0], "exits there": f"{there}", "found": f"{found}"} | shares
 
 
-def _off_row(perception: str, group: Sequence[Flown]) -> list[str]:
+def _off_row(perception: str, group: Sequence[Flown]) -> Line:
     if not group:
-        return []
+        return {}
     moments, beyond = np.sum([f.off for f in group], axis=0).tolist()
-    worst, with_any = [f.off_m for f in group], sum(f.off[1] > 0 for f in group)
-    shares = [f"{100 * beyond / moments:.1f} %", f"{with_any} of {len(group)}"]
-    return [perception, f"{moments}", *shares, f"{np.median(worst):.2f}, {max(worst):.2f}"]
+    worst = [f.off_m for f in group]
+    return {
+        "perception": perception,
+        "ticks with metric scale": f"{moments}",
+        "pose error more than 0.1 m beyond three sigmas": f"{100 * beyond / moments:.1f} %",
+        "flights with any": f"{sum(f.off[1] > 0 for f in group)} of {len(group)}",
+        "maximum error, median and worst [m]": f"{np.median(worst):.2f}, {max(worst):.2f}",
+    }
 
 
-def _row(names: tuple[str, ...], group: Sequence[Flown]) -> list[str]:
+def _row(names: tuple[str, ...], group: Sequence[Flown]) -> Line:
     """``names``: world, fault, behaviour, perception."""
     world, fault, behaviour, perception = names
     n = len(group)
     ratio = [f.time_s / f.oracle_s for f in group if f.reached and f.oracle_s]
     cruise = [f.cruise_m_s for f in group if math.isfinite(f.cruise_m_s)]
-    return [
-        world,
-        behaviour,
-        fault,
-        perception,
-        str(n),
-        _share(sum(f.reached for f in group), n),
-        _share(sum(f.contacts > 0 for f in group), n),
-        _share(sum(f.landed and not f.contacts for f in group), n),
-        f"{np.median([f.clearance_p5_m for f in group]):.2f}, {min(f.clearance_min_m for f in group):.2f}",
-        f"{np.median(ratio):.2f}" if ratio else "",
-        f"{np.median(cruise):.2f}" if cruise else "",
-        f"{np.median([f.cpu_ms for f in group]):.1f}, {max(f.cpu_worst_ms for f in group):.0f}",
-    ]
+    clearance_m = np.median([f.clearance_p5_m for f in group]), min(f.clearance_min_m for f in group)
+    cpu_ms = np.median([f.cpu_ms for f in group]), max(f.cpu_worst_ms for f in group)
+    return {
+        "world": world,
+        "behaviour": behaviour,
+        "fault": fault,
+        "perception": perception,
+        "flights": str(n),
+        "reached": _share(sum(f.reached for f in group), n),
+        "contact": _share(sum(f.contacts > 0 for f in group), n),
+        "no contact and landed on the floor": _share(sum(f.landed and not f.contacts for f in group), n),
+        "clearance p5, min [m]": f"{clearance_m[0]:.2f}, {clearance_m[1]:.2f}",
+        "time over oracle": f"{np.median(ratio):.2f}" if ratio else "",
+        "cruise [m/s]": f"{np.median(cruise):.2f}" if cruise else "",
+        "CPU a tick, worst [ms]": f"{cpu_ms[0]:.1f}, {cpu_ms[1]:.0f}",
+    }

@@ -10,7 +10,6 @@ from markdown_rows import rows
 from edgeslam_torch.commands.judging import bench
 from edgeslam_torch.eval.benchmark.benchmark import BenchSettings, figures_of, markdown_bench, sequences
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.experiment.figures import read_record
 from edgeslam_torch.eval.metrics.run_score import evaluate_run
 
 
@@ -46,12 +45,6 @@ def test_only_recordings_at_camera_rate_are_benchmarked(run_folder, tmp_path):
         sequences(BenchSettings(tmp_path / "nowhere"))
 
 
-def test_a_record_of_another_version_is_none(tmp_path):
-    (tmp_path / "r.json").write_text('{"format": 0, "runs": []}')
-    with pytest.raises(EvaluationError, match="r.json"):
-        read_record(tmp_path / "r.json", "bench", (1, 2, 3), "runs")
-
-
 def run_bench(*words):
     parser = argparse.ArgumentParser()
     bench.add_arguments(parser)
@@ -63,6 +56,9 @@ def test_compare_reads_two_results(tmp_path, capsys):
         (tmp_path / f"{name}.json").write_text(json.dumps(record([ate, ate])))
     assert run_bench("--compare", tmp_path / "a.json", tmp_path / "b.json") == 0
     assert "0.0100 -> 0.0200 x2.00 !" in capsys.readouterr().out
+    (tmp_path / "b.json").write_text('{"format": 0, "runs": []}')  # of another version
+    with pytest.raises(EvaluationError, match=r"b\.json"):
+        run_bench("--compare", tmp_path / "a.json", tmp_path / "b.json")
 
 
 @pytest.mark.slow

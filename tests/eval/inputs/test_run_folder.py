@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from summaries import with_summary
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.run_folder import is_supported, open_run
@@ -41,6 +42,15 @@ def test_the_truth_of_a_recording_of_any_layout_is_the_runs_own(tmp_path, record
     assert open_run(run).own_truth == run / f"../data/{recording}"
     (tmp_path / "data" / files[-1]).unlink()
     assert open_run(run).own_truth is None
+
+
+def test_source_beside_the_run_is_found_by_its_relative_name(run_folder, tmp_path):
+    run_folder(tmp_path / "run", points=10)
+    recording = tmp_path / "recording"
+    recording.mkdir()
+    names = ("../recording", str(recording), "x" * 5000, "\0")
+    found = [open_run(with_summary(tmp_path / "run", source={"path": name})).source for name in names]
+    assert found == [tmp_path / "run" / "../recording", recording, None, None]
 
 
 @pytest.mark.parametrize("row", ["stamp_s,scale", "x,1", "1,x", "1,\xff", '1,"' + 200_000 * "x"])
