@@ -24,7 +24,7 @@ class Row:
     """One line of the ablation's table."""
 
     title: str
-    set: tuple[str, ...] = ()
+    set: Sequence[str] = ()
     """``section.key=value`` on top of the defaults."""
     against: str = DEFAULT
     """Name of the row it is compared with."""
@@ -32,10 +32,8 @@ class Row:
     """Statement that its process executes before the run, for what no setting changes."""
 
 
-ROWS = {
-    name: Row(row["title"], tuple(row.get("set", ())), row.get("against", DEFAULT), row.get("first", ""))
-    for name, row in tomllib.loads(Path(__file__).with_name("ablation.toml").read_text(encoding="utf-8")).items()
-}
+_TABLE = tomllib.loads(Path(__file__).with_name("ablation.toml").read_text(encoding="utf-8"))
+ROWS = {name: Row(**row) for name, row in _TABLE.items()}
 """The table of `edgeslam ablation` by name, top to bottom."""
 
 _JUDGED = ("ate_sim3_m", "ate_online_sim3_m", "map_median_m", "edges_within_2cm", "map_points")

@@ -32,13 +32,12 @@ def match(truth_s: FloatArray, estimate_s: FloatArray, max_dt_s: float = DEFAULT
 
     The same rule as evo's, so that figures agree.
     """
-    if len(estimate_s) <= len(truth_s):
-        other = nearest(truth_s, estimate_s)
-        ok = np.abs(truth_s[other] - estimate_s) <= max_dt_s
-        return other[ok], np.flatnonzero(ok)
-    other = nearest(estimate_s, truth_s)
-    ok = np.abs(estimate_s[other] - truth_s) <= max_dt_s
-    return np.flatnonzero(ok), other[ok]
+    if len(estimate_s) > len(truth_s):
+        j, i = match(estimate_s, truth_s, max_dt_s)
+        return i, j
+    i = nearest(truth_s, estimate_s)
+    ok = np.abs(truth_s[i] - estimate_s) <= max_dt_s
+    return i[ok], np.flatnonzero(ok)
 
 
 def associate(

@@ -48,14 +48,13 @@ def open_dataset(folder: Path | str) -> EvalDataset:
     folder = Path(folder)
     if not folder.is_dir():
         raise EvaluationError(f"{folder}: no such data set folder")
-    sequence, camera = _sequence(folder)
+    sequence, camera, depth = _opened(folder)
     if sequence is None:
         sequence = Sequence("poses", folder, (), groundtruth=_poses_alone(folder))
     if sequence.groundtruth is None:
         raise EvaluationError(f"{folder}: no true poses in this folder, such as groundtruth.txt")
     stamps = sequence.groundtruth_stamps_s
     truth = read_trajectory(sequence.groundtruth, None if stamps is None else np.array(stamps))
-    depth = _depth(sequence) if camera is not None else None
     frames = np.array([entry.stamp_s for entry in sequence.images])
     paths = tuple(entry.path for entry in sequence.images)
     return EvalDataset(sequence.name, folder, truth, frames, paths, camera, depth)
@@ -68,11 +67,10 @@ def open_depth(folder: Path | str) -> tuple[Sequence, DepthMaps, Camera]:
         EvaluationError: If the folder has no depth maps, or its camera is not known.
     """
     folder = Path(folder)
-    sequence, camera = _sequence(folder)
-    depth = _depth(sequence) if sequence is not None else None
-    if sequence is None or depth is None or not sequence.images:
+    sequence, camera, depth = _opened(folder)
+    if sequence is None or sequence.depth is None or not sequence.images:
         raise EvaluationError(f"{folder}: no depth.txt and rgb.txt, nor *.depth.png, in this folder")
-    if camera is None:
+    if camera is None or depth is None:
         raise EvaluationError(f"{folder}: the camera is not known; put a camera.yaml into the folder")
     return sequence, depth, camera
 
@@ -127,22 +125,17 @@ def interpolate(trajectory: Trajectory, stamps_s: FloatArray) -> tuple[FloatArra
     return T, exact | ((known[right] - known[right - 1] <= _MAX_TRUTH_GAP_S) & (inside == stamps_s))
 
 
-def _sequence(folder: Path) -> tuple[Sequence | None, Camera | None]:
-    """The recording in a folder, and its colour camera."""
+def _opened(folder: Path) -> tuple[Sequence | None, Camera | None, DepthMaps | None]:
+    """The recording in a folder, its colour camera, and with one its depth maps."""
     try:
         sequence = read_sequence(folder)
         if sequence is None:
-            return None, None
-        return sequence, known_camera((folder, sequence.folder), sequence.camera)
+            return None, None, None
+        camera = known_camera((folder, sequence.folder), sequence.camera)
+        depth = None if camera is None or sequence.depth is None else sequence.depth()
     except (SourceError, CalibrationError) as error:
         raise EvaluationError(str(error)) from error
-
-
-def _depth(sequence: Sequence) -> DepthMaps | None:
-    try:
-        return None if sequence.depth is None else sequence.depth()
-    except (SourceError, CalibrationError) as error:
-        raise EvaluationError(str(error)) from error
+    return sequence, camera, depth
 
 
 def _poses_alone(folder: Path) -> Path:

@@ -10,7 +10,7 @@ import numpy as np
 
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.associate import nearest
+from edgeslam_torch.eval.inputs.associate import match
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.files.record_files import read_mapping, recording_of
 from edgeslam_torch.files.tables import read_text
@@ -66,10 +66,8 @@ class RunFolder:
 
     def keyframe_poses(self) -> list[int]:
         """Poses of ``trajectory`` that are keyframes; every tenth without that column in ``status.csv``."""
-        stamps = [float(r.get("stamp_s") or "nan") for r in self.status if is_keyframe(r)]
-        index = nearest(self.trajectory.stamps_s, np.array(stamps)) if stamps else np.zeros(0, dtype=int)
-        ok = [int(i) for i, t in zip(index, stamps, strict=True) if abs(self.trajectory.stamps_s[i] - t) < 1e-3]
-        return ok or list(range(0, len(self.trajectory), 10))
+        index = [k for k, row in enumerate(self.pose_rows) if is_keyframe(row)]
+        return index or list(range(0, len(self.trajectory), 10))
 
     @property
     def source(self) -> Path | None:
@@ -91,11 +89,14 @@ class RunFolder:
 
     @property
     def pose_rows(self) -> tuple[dict[str, str], ...]:
-        """Rows of ``status.csv`` that belong to poses of ``trajectory``: of a run in pieces, those of the largest."""
+        """Row of ``status.csv`` for each pose of ``trajectory``, empty where there is none; of a run in pieces the
+        others' rows are left out."""
         if len(self.status) == len(self.trajectory):
             return self.status
-        there = {round(stamp, 6) for stamp in self.trajectory.stamps_s.tolist()}
-        return tuple(row for row in self.status if round(float(row.get("stamp_s") or "nan"), 6) in there)
+        stamps = np.array([float(row.get("stamp_s") or "inf") for row in self.status] or [np.inf])
+        order = np.argsort(stamps, kind="stable")
+        found = dict(zip(*match(self.trajectory.stamps_s, stamps[order], 1e-3), strict=True))
+        return tuple(self.status[order[found[k]]] if k in found else {} for k in range(len(self.trajectory)))
 
     @property
     def trusted_frames(self) -> int:

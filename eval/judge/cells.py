@@ -16,8 +16,6 @@ from edgeslam_torch.eval.judge.simulated_telemetry import KINDS
 from edgeslam_torch.readers.source import Recording
 from edgeslam_torch.synthetic.flights.courses import COURSES
 
-SETS = ("base", "variants", "flights", "telemetry", "imu", "all")
-"""Images of recordings, their variants, simulated flights, simulated telemetry, recorded and simulated IMUs, all."""
 CASES: dict[str, Any] = tomllib.loads(Path(__file__).with_name("cases.toml").read_text(encoding="utf-8"))
 MIN_FRAMES = 30
 """Shorter recordings, and variants that leave fewer, are not judged."""
@@ -103,15 +101,14 @@ def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequen
 
     Args:
         data: Folder of recordings; None leaves them out.
-        which: One of `SETS`.
+        which: ``base``, images of recordings; ``variants`` of them; simulated ``flights``; simulated ``telemetry``;
+            recorded and simulated ``imu``; ``all``.
         seeds: Of every cell.
         only: Patterns such as ``tum_*``; a cell's name must match one. All when empty.
 
     Raises:
         EvaluationError: If nothing is left to judge.
     """
-    if which not in SETS:
-        raise EvaluationError(f"no set {which!r}; there are {', '.join(SETS)}")
     made = [cell for of, cell in (*_of_recordings(data), *_of_simulations()) if which in (of, "all")]
     kept = [cell for cell in made if not only or any(fnmatchcase(cell.name, pattern) for pattern in only)]
     if not kept:

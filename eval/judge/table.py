@@ -128,8 +128,17 @@ def markdown(record: dict[str, Any], thresholds: Sequence[Threshold]) -> str:
     rows = record["rows"]
     cells = grouped(rows, "cell")
     header = ["cell", *(c.title for c in COLUMNS), "thresholds"]
-    lines = [[name, *_cells(own), _passed(name, rows, thresholds)] for name, own in cells.items()]
-    parts = [_conditions(record), "", markdown_table(header, lines), "", *_outcome(lines, rows, thresholds)]
+    found = {name: verdicts(rows, thresholds, name) for name in cells}
+    lines = [[name, *_cells(own), _passed(own, found[name])] for name, own in cells.items()]
+    outcomes = [line[-1] for line in lines if line[-1] != "-"]
+    parts = [_conditions(record), "", markdown_table(header, lines), ""]
+    parts += [f"{outcomes.count('pass')} of {len(outcomes)} cells with thresholds pass."]
+    parts += [f"- {_run_name(row)}: no result: {row['error']}" for row in rows if row["error"]]
+    failed = {name: "; ".join(str(v) for v in of_cell if not v.ok) for name, of_cell in found.items()}
+    parts += [f"- {name}: {limits}" for name, limits in failed.items() if limits]
+    for v in verdicts(rows, thresholds):
+        word, covered = "pass" if v.ok else "FAIL", ", ".join(v.threshold.cells)
+        parts.append(f"- {covered}: {v.threshold} in {v.threshold.share:.0%}: {v.passed} of {v.runs}, {word}")
     notes = [f"- {_run_name(row)}: {note}" for row in rows for note in row["notes"]]
     parts += ["", *notes] if notes else []
     parts += ["", *_FOOTNOTES]
@@ -145,28 +154,11 @@ def _conditions(record: dict[str, Any]) -> str:
     return f"EdgeSLAM-Torch {record['commit']}, {record['made']}, {seeds} seed(s){changed}{frames}"
 
 
-def _passed(name: str, rows: Sequence[Row], thresholds: Sequence[Threshold]) -> str:
-    own = [row for row in rows if row["cell"] == name]
-    errors = [row["error"] for row in own if row["error"]]
-    if errors:
-        return f"FAIL {len(errors)} of {len(own)} runs"
-    found = verdicts(rows, thresholds, name)
+def _passed(own: Sequence[Row], found: Sequence[Verdict]) -> str:
+    if errors := sum(bool(row["error"]) for row in own):
+        return f"FAIL {errors} of {len(own)} runs"
     failed = sum(not v.ok for v in found)
     return (f"FAIL {failed} of {len(found)}" if failed else "pass") if found else "-"
-
-
-def _outcome(lines: Sequence[Sequence[str]], rows: Sequence[Row], thresholds: Sequence[Threshold]) -> list[str]:
-    """How many cells pass, what fails, and the thresholds that only a share of runs must pass."""
-    outcomes = [line[-1] for line in lines if line[-1] != "-"]
-    out = [f"{outcomes.count('pass')} of {len(outcomes)} cells with thresholds pass."]
-    out += [f"- {_run_name(row)}: no result: {row['error']}" for row in rows if row["error"]]
-    for name, *_ in lines:
-        failed = [str(v) for v in verdicts(rows, thresholds, name) if not v.ok]
-        out += [f"- {name}: {'; '.join(failed)}"] if failed else []
-    for v in verdicts(rows, thresholds):
-        word, cells = "pass" if v.ok else "FAIL", ", ".join(v.threshold.cells)
-        out.append(f"- {cells}: {v.threshold} in {v.threshold.share:.0%}: {v.passed} of {v.runs}, {word}")
-    return out
 
 
 def _cells(rows: Sequence[Row]) -> list[str]:

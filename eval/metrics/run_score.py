@@ -202,7 +202,7 @@ def _coverage(
         return share, share, float(inside[0] - truth.stamps_s[0]) if len(inside) else float("nan")
     count = len(frames)
     begin = max(float(frames[0]), float(run.status[0].get("stamp_s") or "nan")) if run.status else float(frames[0])
-    rows = zip(run.pose_rows, run.trajectory.stamps_s, strict=False)
+    rows = zip(run.pose_rows, run.trajectory.stamps_s, strict=True)
     first = next((stamp for row, stamp in rows if is_supported(row)), run.trajectory.stamps_s[0])
     trusted = min(1.0, run.trusted_frames / count)
     return trusted, min(1.0, len(run.trajectory) / count), float(first) + offset_s - begin

@@ -16,7 +16,6 @@ import numpy as np
 
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.associate import match
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_keyframe, open_run
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run, finite
@@ -124,10 +123,11 @@ def judge_run(run: RunFolder, groundtruth: Path | str | None, judge_map: bool) -
 def _payload(
     run: RunFolder, edges: PointCloud, anchors: PointCloud, score: RunScore | None, turn: FloatArray
 ) -> tuple[dict[str, Any], str, str]:
-    trajectory = run.trajectory.take(slice(None, None, max(1, -(-len(run.trajectory) // _MAX_POSES))))
+    shown = slice(None, None, max(1, -(-len(run.trajectory) // _MAX_POSES)))
+    trajectory = run.trajectory.take(shown)
     begin = float(run.trajectory.stamps_s[0])
     positions = trajectory.positions @ turn.T
-    table = _StatusTable(run, trajectory)
+    table = _StatusTable(run, shown)
     edge_meta, edge_bytes = _packed(edges, turn)
     anchor_meta, anchor_bytes = _packed(anchors, turn)
     rotations = np.swapaxes(turn @ trajectory.T_w_c[:, :3, :3], 1, 2)  # rows are the camera's axes in the world
@@ -170,17 +170,8 @@ def _payload(
 class _StatusTable:
     """``status.csv`` beside the poses that the page shows; any column may be missing."""
 
-    def __init__(self, run: RunFolder, trajectory: Trajectory) -> None:
-        self.all_rows = run.status
-        self.all_stamps = np.array([words.number(r.get("stamp_s")) for r in run.status], dtype=np.float64)
-        self.rows: list[dict[str, str]] = []
-        if len(self.all_stamps) and np.isfinite(self.all_stamps).all():
-            order = np.argsort(self.all_stamps, kind="stable")
-            i, j = match(self.all_stamps[order], trajectory.stamps_s, 1e-3)
-            found = dict(zip(j.tolist(), order[i].tolist(), strict=True))
-            self.rows = [run.status[found[k]] if k in found else {} for k in range(len(trajectory))]
-        else:
-            self.rows = [{}] * len(trajectory)
+    def __init__(self, run: RunFolder, shown: slice) -> None:
+        self.all_rows, self.rows = run.status, run.pose_rows[shown]
         self.codes = [_status_code(r) for r in self.rows]
         everything = [_status_code(r) for r in run.status] or self.codes
         self.counts = [everything.count(k) for k in range(len(STATUSES))]
@@ -230,8 +221,8 @@ class _StatusTable:
     def events(self, begin: float, most: int = 40) -> list[list[str]]:
         """Stretches that were not plainly tracked: from, to, frames, status, reason."""
         out: list[list[Any]] = []
-        for row, stamp in zip(self.all_rows, self.all_stamps, strict=True):
-            status, reason = row.get("status", ""), row.get("reason", "")
+        for row in self.all_rows:
+            stamp, status, reason = words.number(row.get("stamp_s")), row.get("status", ""), row.get("reason", "")
             if status == "tracked" and not reason:
                 out.append([])
                 continue

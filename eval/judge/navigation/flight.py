@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from edgeslam_torch.eval.judge.navigation.perception import (
     TruePerception,
     nothing_painted,
 )
+from edgeslam_torch.eval.metrics.align import travelled
 from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.navigation.drone_state import DroneState
@@ -105,12 +105,8 @@ class _Tasks:
         return self.flight_controller.result() is not None and not self._steps
 
 
-@dataclass(slots=True)
-class _Tick:
-    p_w: FloatArray
-    speed_m_s: float
-    clearance_m: float
-    cpu_s: float
+_Tick = tuple[FloatArray, float, float, float]
+"""True position, speed [m/s], clearance [m], and the planner's CPU time [s]."""
 
 
 def _fly(
@@ -142,8 +138,7 @@ def _fly(
             controller.plan(state)
         order = controller.order(state)
         cpu_s = time.process_time() - began
-        speed, clear_m = float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w)
-        ticks.append(_Tick(drone.p_w.copy(), speed, clear_m, cpu_s))
+        ticks.append((drone.p_w.copy(), float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w), cpu_s))
         if order.danger:
             dangers[str(order.danger)] = None
         landing = tasks.over() or order.land
@@ -175,11 +170,10 @@ def _sum_up(found: Flown, site: Site, drone: DroneModel, ticks: list[_Tick], beh
     """Compute the figures from the ticks."""
     if not ticks:
         return
-    p = np.array([t.p_w for t in ticks])
-    hull = np.array([t.clearance_m for t in ticks]) - NavLimits().radius_m
-    speed, cpu = np.array([t.speed_m_s for t in ticks]), 1e3 * np.array([t.cpu_s for t in ticks])
+    p, speed, clearance_m, cpu_s = (np.array(column) for column in zip(*ticks, strict=True))
+    hull, cpu = clearance_m - NavLimits().radius_m, 1e3 * cpu_s
     found.track_w = np.round(p, 3).tolist()
-    found.path_m = float(np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1).sum())
+    found.path_m = float(travelled(p[:, :2])[-1])
     found.distance_m = float(np.linalg.norm(drone.p_w[:2] - site.goal_w[:2]))
     found.home_m = float(np.linalg.norm(drone.p_w[:2]))
     found.reached = found.ended == str(Phase.DONE) and not found.contacts and behaviour.reached(found, site)
@@ -210,4 +204,4 @@ def shortest_m(site: Site, limits: NavLimits) -> float:
     need_m = limits.clearance_m(0.0)
     plan = cost_to_go(layer, layer.cells(site.goal_w[None, :2]), need_m, need_m, layer.cells(start))
     way = plan.way(start, 100.0)
-    return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()) if np.isfinite(plan.at(start)) else float("inf")
+    return float(travelled(way)[-1]) if np.isfinite(plan.at(start)) else float("inf")

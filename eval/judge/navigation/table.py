@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
             out / FLIGHTS,
             case.name,
             "edgeslam_torch.eval.judge.navigation.table:run_flight",
-            {"commit": commit, "flight": Flown(case).record()["case"]},
+            {"commit": commit, "flight": asdict(case)},
         )
         for case in cases
     }
@@ -55,7 +56,7 @@ def run_flight(case: dict[str, Any], folder: Path) -> dict[str, Any]:
     from edgeslam_torch.eval.judge.navigation.over_udp import fly_over_udp
 
     given = Case(**case["flight"])
-    return {"flown": (fly_over_udp if given.perception == "udp" else fly)(given).record()}
+    return {"flown": asdict((fly_over_udp if given.perception == "udp" else fly)(given))}
 
 
 def _flown(case: Case, found: dict[str, Any] | None, error: str) -> Flown:

@@ -181,7 +181,7 @@ def test_recordings_with_truth_are_found_and_short_variants_left_out(recording):
     assert VARIANTS["half_rate"].frames_of(36) == 18
 
 
-def test_cells_are_chosen_by_pattern_and_repeated_by_seed(recording):
+def test_cells_are_chosen_by_pattern_and_repeated_by_seed(recording, tmp_path):
     cells = list_cells(recording.parent, "variants", [0, 1], ["*/focal_*"])
     assert [(c.name, c.seed) for c in cells] == [
         ("stairs/focal_up", 0), ("stairs/focal_up", 1), ("stairs/focal_down", 0), ("stairs/focal_down", 1)
@@ -189,6 +189,10 @@ def test_cells_are_chosen_by_pattern_and_repeated_by_seed(recording):
     assert {c.base for c in cells} == {"stairs"}
     with pytest.raises(EvaluationError, match="no cell matches; there are: .*stairs/half_size"):
         list_cells(recording.parent, "variants", [0], ["nothing"])
+    with pytest.raises(EvaluationError, match="no such folder of recordings"):
+        list_cells(tmp_path / "gone", "base", [0])
+    with pytest.raises(SourceError, match="no such file or folder"):
+        run(tmp_path, Cell("gone", 0, str(tmp_path / "gone")))
 
 
 def test_a_cut_shows_one_world_and_then_the_next(recording, tmp_path, monkeypatch):
@@ -211,11 +215,6 @@ def test_a_cut_shows_one_world_and_then_the_next(recording, tmp_path, monkeypatc
     assert source.telemetry == [] and source.length == 8 and truth.poses is None
 
 
-def test_cell_that_cannot_run_says_why(tmp_path):
-    with pytest.raises(SourceError, match="no such file or folder"):
-        run(tmp_path, Cell("gone", 0, str(tmp_path / "gone")))
-
-
 @pytest.mark.parametrize("kind", ["noise", "black", pytest.param("frozen", marks=pytest.mark.slow)])
 def test_nothing_to_see_is_a_source_like_any_other(kind):
     source = flights.nothing_to_see(kind, 1)
@@ -233,8 +232,3 @@ def test_a_further_flight_through_the_building_takes_off_from_the_same_place(tmp
     first = flights.flown(COURSES["building"], 0)[1].T_w_c[:, :3, 3]
     apart = np.linalg.norm(open_dataset(tmp_path / "again").truth.positions - first, axis=1)
     assert apart[0] < 0.05 and apart.max() > 0.1
-
-
-def test_folder_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(EvaluationError, match="no such folder of recordings"):
-        list_cells(tmp_path / "gone", "base", [0])

@@ -24,6 +24,11 @@ def test_error_worked_out_by_hand():
     assert found.rmse_m == pytest.approx(np.sqrt((0.04 + 4.0) / 3))
     assert found.log_rmse == pytest.approx(np.sqrt((np.log(1.2) ** 2 + np.log(2.0) ** 2) / 3))
     assert (found.delta1, found.delta2, found.delta3) == pytest.approx((2 / 3, 2 / 3, 2 / 3))
+    scaled = score_depth(0.4 * truth, truth, median_scaled=True)
+    assert scaled.scale == pytest.approx(2.5) and scaled.abs_rel == pytest.approx(0.0, abs=1e-12)
+    assert score_depth(0.4 * truth, truth).delta1 == 0.0
+    small, large = (score_depth(np.full((n, n), d), np.ones((n, n))) for n, d in ((2, 1.2), (9, 1.1)))
+    assert mean_score([small, large]).abs_rel == pytest.approx(0.15), "over maps, not pixels"
 
 
 def test_edges_are_judged_alone():
@@ -107,16 +112,3 @@ def test_fastdepth_sample_scores_as_computed_directly(data_dir):
     assert found["metric"].abs_rel == pytest.approx(0.14049818, abs=1e-6)
     assert found["metric"].delta1 == pytest.approx(0.77726403, abs=1e-6)
     assert found["edges_metric"].pixels > 1000
-
-
-def test_median_scaling_removes_a_factor(rng):
-    truth = rng.uniform(1.0, 5.0, (20, 30))
-    found = score_depth(0.4 * truth, truth, median_scaled=True)
-    assert found.scale == pytest.approx(2.5)
-    assert found.abs_rel == pytest.approx(0.0, abs=1e-12)
-    assert score_depth(0.4 * truth, truth).delta1 == 0.0
-
-
-def test_mean_is_over_maps():
-    a, b = score_depth(np.full((2, 2), 1.2), np.ones((2, 2))), score_depth(np.full((9, 9), 1.1), np.ones((9, 9)))
-    assert mean_score([a, b]).abs_rel == pytest.approx(0.15)
