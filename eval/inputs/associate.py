@@ -125,12 +125,18 @@ def on_one_clock(truth: Trajectory, estimate: Trajectory) -> tuple[Trajectory, T
     return truth, estimate
 
 
-def _stamped_like(mine: Trajectory, other: Trajectory) -> Trajectory:
-    if mine.stamped or not other.stamped:
+def in_order(mine: Trajectory, stamps_s: FloatArray, whose: str) -> Trajectory:
+    """The poses of a file without stamps under ``stamps_s`` that are as many; else as they are."""
+    if mine.stamped or len(mine) != len(stamps_s):
         return mine
-    if len(mine) == len(other):
-        note = f"no stamps in the file: its poses are taken for those of {other.source}, in order"
-        return replace(mine, stamps_s=other.stamps_s, numbered="", notes=(note,))
+    note = f"no stamps in the file: its poses are taken for {whose}, in order"
+    return replace(mine, stamps_s=stamps_s, numbered="", notes=(note,))
+
+
+def _stamped_like(mine: Trajectory, other: Trajectory) -> Trajectory:
+    if not other.stamped:
+        return mine
+    mine = in_order(mine, other.stamps_s, f"those of {other.source}")
     if mine.numbered == ROWS:
         raise EvaluationError(
             f"{mine.source}: {len(mine)} rows without times, and {len(other)} poses in {other.source}; put a times.txt "

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,17 +43,25 @@ class RunFolder:
         return self.path.resolve().name
 
     @property
+    def scale(self) -> dict[str, Any]:
+        """What the run says of its scale; empty for a bare trajectory."""
+        return record(self.summary.get("scale"))
+
+    @property
+    def scale_sigma(self) -> float:
+        """Standard deviation of the scale's logarithm, as stated by the run; NaN when it states none."""
+        return number(self.scale.get("sigma")) / (number(self.scale.get("value")) or math.nan)
+
+    @property
     def units(self) -> str:
-        """``metres`` or ``arbitrary``, as stated by the run; ``unknown`` when it states none (a bare trajectory)."""
-        scale = self.summary.get("scale")
-        return str(scale.get("units", "unknown")) if isinstance(scale, dict) else "unknown"
+        """``metres`` or ``arbitrary``, as stated by the run; ``unknown`` when it states none."""
+        return str(self.scale.get("units", "unknown"))
 
     @property
     def up(self) -> str:
         """Source of gravity (``telemetry``, ``edges``, ...); ``unknown`` when nothing does, or an older run does
         not say."""
-        up = self.summary.get("up")
-        return str(up.get("source", "unknown")) if isinstance(up, dict) else "unknown"
+        return str(record(self.summary.get("up")).get("source", "unknown"))
 
     @property
     def vertical(self) -> str:
@@ -134,6 +143,20 @@ def _has_truth(recording: Path) -> bool:
     except EdgeSlamError:  # damaged since the run
         return False
     return sequence is not None and sequence.groundtruth is not None
+
+
+def number(value: object) -> float:
+    """A value of a file that may hold anything as a number; NaN if it is none, or not finite."""
+    try:
+        found = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+    return found if math.isfinite(found) else math.nan
+
+
+def record(value: object) -> dict[str, Any]:
+    """The same as a record; empty if it is none."""
+    return value if isinstance(value, dict) else {}
 
 
 def is_keyframe(row: dict[str, str]) -> bool:

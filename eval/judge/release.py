@@ -82,8 +82,7 @@ def release_record(rows: Sequence[Row], commit: str, outputs: dict[str, list[str
 
 
 def _rounded(value: Any, figure: str) -> float | int:
-    decimals = FIGURES[figure]
-    return round(float(value), decimals) if decimals else round(float(value))
+    return round(float(value), FIGURES[figure] or None)
 
 
 def command_outputs(data: Path, out: Path, commit: str, say: Callable[[str], None]) -> dict[str, list[str]]:

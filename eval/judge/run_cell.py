@@ -116,7 +116,7 @@ def opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tru
         drawn = Drawn(dataset.truth, dataset.frame_stamps_s, cell.seed)
         return replace(source, telemetry=KINDS[cell.telemetry](drawn)), Truth(place)
     source = _with_imu(cell, source, place)
-    truth = Truth(place, place if dataset.depth is not None else None)
+    truth = Truth(place, dataset.depth is not None)
     return VARIANTS[cell.variant].applied_to(source, cell.seed) if cell.variant else source, truth
 
 

@@ -36,8 +36,8 @@ class Truth:
 
     poses: Path | None
     """Data set folder or trajectory file; None when there is nothing to compare with."""
-    depth: Path | None = None
-    """Data set whose depth maps judge the map."""
+    has_depth: bool = False
+    """Whether depth maps of the data set judge the map."""
     surfaces: Surfaces | None = None
     """Distances ``(N,)`` [m] of points ``(N, 3)`` to the surfaces of a simulated world, instead of depth maps."""
 
@@ -52,13 +52,12 @@ def score(run_dir: Path, truth: Truth) -> tuple[Figures, list[str]]:
     figures: dict[str, Any] = _own_figures(run)
     notes: list[str] = []
     if truth.poses is not None:
-        judge_map = truth.surfaces is None and truth.depth is not None
         try:
-            found = evaluate_run(run.path, truth.poses, truth.depth, judge_map=judge_map, thresholds_m=MAP_THRESHOLDS_M)
+            found = evaluate_run(run.path, truth.poses, judge_map=truth.has_depth, thresholds_m=MAP_THRESHOLDS_M)
             for metric in METRICS:
                 figures |= metric(run, found)
             figures |= _map(run, found, truth.surfaces)
-            notes += [found.map_note] if judge_map and found.map is None else []
+            notes += [found.map_note] if truth.has_depth and found.map is None else []
         except EvaluationError as error:
             notes.append(str(error).removeprefix(f"{run.trajectory.source}: "))
             figures |= _standing_still(run, truth.poses)
@@ -71,8 +70,7 @@ def _own_figures(run: RunFolder) -> dict[str, Any]:
     clouds = [cloud for name in ("edge_map.ply", "anchors.ply") if (cloud := run.cloud(name)) is not None]
     p_w = np.concatenate([c.p_w for c in clouds]) if clouds else np.zeros((0, 3))
     offered = max(int(summary.get("frames", 0)) + int(summary.get("left_out", 0)), 1)
-    counts, scale = summary.get("map") or {}, summary.get("scale") or {}
-    sources = str(scale.get("source", "")).split("+")
+    counts, sources = summary.get("map") or {}, str(run.scale.get("source", "")).split("+")
     supported = at_end(run.pose_rows, run.trajectory.T_w_c, p_w, load_camera(run.path / "camera.yaml"))
     return {
         "frames": summary.get("frames"),
@@ -80,8 +78,8 @@ def _own_figures(run: RunFolder) -> dict[str, Any]:
         "supported_live": np.sum(live(run.status)) / offered,
         "losses": summary.get("lost_events"),
         "pieces": sum(piece["supported"] > 0 for piece in summary.get("pieces") or ()),
-        "metric": float(scale.get("units") == "metres"),
-        "scale_sigma": _own_sigma(run),
+        "metric": float(run.units == "metres"),
+        "scale_sigma": run.scale_sigma or None,
         "by_telemetry": float("telemetry" in sources or "height" in sources),
         "said": float(any("telemetry" in warning for warning in summary.get("warnings") or ())),
         "map_points": counts.get("edge_points"),
@@ -89,12 +87,6 @@ def _own_figures(run: RunFolder) -> dict[str, Any]:
         "wall_s": summary.get("duration_s"),
         "memory_mb": summary.get("peak_rss_mb"),
     }
-
-
-def _own_sigma(run: RunFolder) -> float | None:
-    """Standard deviation of log scale that the run states."""
-    scale = run.summary.get("scale") or {}
-    return float(scale["sigma"]) / float(scale["value"]) if scale.get("sigma") else None
 
 
 def _trajectory(_: RunFolder, found: RunScore) -> dict[str, Any]:
@@ -116,9 +108,9 @@ def _percent(error_m: float, path_m: float) -> float | None:
 
 
 def _scale(run: RunFolder, score: RunScore) -> dict[str, Any]:
-    scale, sigma = score.sim3.scale, _own_sigma(run)
+    scale, sigma = score.sim3.scale, run.scale_sigma
     found = {"scale": scale if score.units == "metres" else None, "scale_sim3": scale}
-    if sigma is None or scale <= 0:
+    if not sigma > 0 or scale <= 0:
         return found | dict.fromkeys(("scale_z", "scale_off", "scale_sigmas"))
     off = np.log(scale)
     return found | {"scale_z": off / sigma, "scale_off": abs(off), "scale_sigmas": abs(off) / sigma}

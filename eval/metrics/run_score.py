@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, on_one_clock
+from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, in_order, on_one_clock
 from edgeslam_torch.eval.inputs.dataset import EvalDataset, interpolate, open_dataset
-from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported, open_run
+from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported, open_run, record
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.eval.metrics.align import AlignmentKind, umeyama
 from edgeslam_torch.eval.metrics.diagnose import explain
 from edgeslam_torch.eval.metrics.edge_map_score import THRESHOLDS_M, MapScore, score_map, surface_truth
 from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore, score_trajectory, without_orientation
+from edgeslam_torch.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +67,12 @@ class RunScore:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and strings for JSON; None for a figure that there is not."""
-        record = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("sim3", "truth")}
-        record["map"] = None if self.map is None else asdict(self.map)
-        record |= {name: [asdict(row) for row in getattr(self.sim3, name)] for name in ("relative", "drift")}
-        record |= {"ate_sim3": asdict(self.sim3.ate_m), "rotation": asdict(self.sim3.rotation_deg)}
-        found: dict[str, Any] = finite(record | {"truth_path_m": self.sim3.truth_path_m})
-        return found
+        found = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("sim3", "truth")}
+        found["map"] = None if self.map is None else asdict(self.map)
+        found |= {name: [asdict(row) for row in getattr(self.sim3, name)] for name in ("relative", "drift")}
+        found |= {"ate_sim3": asdict(self.sim3.ate_m), "rotation": asdict(self.sim3.rotation_deg)}
+        plain: dict[str, Any] = finite(found | {"truth_path_m": self.sim3.truth_path_m})
+        return plain
 
 
 def evaluate_run(
@@ -101,7 +102,8 @@ def evaluate_run(
     dataset_dir = Path(dataset_dir)
     dataset = open_dataset(dataset_dir) if dataset_dir.is_dir() else None
     truth = dataset.truth if dataset is not None else read_trajectory(dataset_dir)
-    truth, trajectory = on_one_clock(truth, _stamped(run.trajectory, dataset))
+    images_s = dataset.frame_stamps_s if dataset is not None else np.zeros(0)
+    truth, trajectory = on_one_clock(truth, in_order(run.trajectory, images_s, "the data set's images"))
     run = replace(run, trajectory=trajectory)
     kinds = (AlignmentKind.SIM3, AlignmentKind.SE3, AlignmentKind.NONE)
     sim3, se3, raw = (score_trajectory(truth, trajectory, kind, max_dt_s, offset_s) for kind in kinds)
@@ -111,7 +113,7 @@ def evaluate_run(
     depth_dataset = open_dataset(depth_truth_dir) if depth_truth_dir is not None else dataset
     map_score, map_note = _map_score(run, depth_dataset, sim3, thresholds_m) if judge_map else (None, "not requested")
     one_second = next((r for r in sim3.relative if r.delta == "1 s"), None)
-    coverage, with_pose, first = _coverage(run, dataset, truth, offset_s)
+    coverage, with_pose, first = _coverage(run, images_s, truth, offset_s)
     judged = se3 if run.units == "metres" else sim3
     return RunScore(
         name=run.name,
@@ -121,7 +123,7 @@ def evaluate_run(
         ate_raw_m=raw.ate_m.rmse,
         ate_online_sim3_m=online,
         scale_error=sim3.scale - 1.0,
-        scale_inside_95=_scale_inside(run, sim3.scale),
+        scale_inside_95=abs(sim3.scale - 1.0) <= 1.96 * run.scale_sigma if run.scale_sigma > 0 else None,
         coverage=coverage,
         with_pose=with_pose,
         first_pose_s=first,
@@ -152,14 +154,6 @@ def finite(value: Any) -> Any:
     return value
 
 
-def _stamped(mine: Trajectory, dataset: EvalDataset | None) -> Trajectory:
-    """A file without stamps (KITTI, 7-Scenes) that has a pose for every image gets the images' stamps."""
-    if mine.stamped or dataset is None or len(mine) != len(dataset.frame_stamps_s):
-        return mine
-    note = "no stamps in the file: its poses are taken for the data set's images, in order"
-    return replace(mine, stamps_s=dataset.frame_stamps_s, numbered="", notes=(note,))
-
-
 def _map_score(
     run: RunFolder, dataset: EvalDataset | None, sim3: TrajectoryScore, thresholds_m: Sequence[float]
 ) -> tuple[MapScore | None, str]:
@@ -185,13 +179,9 @@ def _map_score(
         return None, str(error)
 
 
-def _coverage(
-    run: RunFolder, dataset: EvalDataset | None, truth: Trajectory, offset_s: float
-) -> tuple[float, float, float]:
+def _coverage(run: RunFolder, frames: FloatArray, truth: Trajectory, offset_s: float) -> tuple[float, float, float]:
     """Share of frames with a trusted pose and with any pose, and the time of the first [s]."""
-    frames = dataset.frame_stamps_s if dataset is not None else np.zeros(0)
-    source = run.summary.get("source")
-    limit = source.get("length") if isinstance(source, dict) else None
+    limit = record(run.summary.get("source")).get("length")
     if isinstance(limit, int) and 0 < limit < len(frames):
         frames = frames[:limit]  # with --max-frames the run has fewer
     if len(frames) == 0:
@@ -206,12 +196,3 @@ def _coverage(
     first = next((stamp for row, stamp in rows if is_supported(row)), run.trajectory.stamps_s[0])
     trusted = min(1.0, run.trusted_frames / count)
     return trusted, min(1.0, len(run.trajectory) / count), float(first) + offset_s - begin
-
-
-def _scale_inside(run: RunFolder, scale: float) -> bool | None:
-    """Whether the true scale lies within the run's stated interval."""
-    stated = run.summary.get("scale")
-    if not isinstance(stated, dict) or not stated.get("sigma") or not stated.get("value"):
-        return None
-    relative = float(stated["sigma"]) / float(stated["value"])
-    return bool(abs(scale - 1.0) <= 1.96 * relative) if np.isfinite(relative) else None

@@ -5,7 +5,6 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -70,7 +69,7 @@ def _page(sides: Sequence[_Side]) -> str:
     body = [
         f'<header class="wrap"><p class="eyebrow">EdgeSLAM-Torch, two runs</p><h1>{title}</h1></header>',
         f'<section class="wrap two">{"".join(map(_about, range(2), sides))}</section>',
-        f'<section class="wrap"><h2>Figures</h2>{_table(_HEAD, _figures(sides))}</section>',
+        f'<section class="wrap"><h2>Figures</h2>{line_drawings.table(_HEAD, _figures(sides))}</section>',
         f'<section class="wrap"><h2>Paths</h2>{_paths(sides)}</section>',
         _different("Settings that differ", *(_settings(side.run) for side in sides)),
         _different("Other values that differ", *(_values(side.run) for side in sides)),
@@ -177,10 +176,5 @@ def _different(heading: str, a: dict[str, str], b: dict[str, str]) -> str:
     rows = [[name, a.get(name, _NONE), b.get(name, _NONE)] for name in names if a.get(name) != b.get(name)]
     if not rows:
         return f'<section class="wrap"><h2>{heading}</h2><p class="note">None.</p></section>'
-    return f'<section class="wrap"><h2>{heading}</h2><div class="words">{_table(["", "A", "B"], rows)}</div></section>'
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    first = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
-    rest = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f'<div class="scroll"><table><tr>{first}</tr>{rest}</table></div>'
+    table = line_drawings.table(["", "A", "B"], rows)
+    return f'<section class="wrap"><h2>{heading}</h2><div class="words">{table}</div></section>'

@@ -1,15 +1,14 @@
 """The flight in a run's page: way, clearance, and what happened, from the ``moments.csv`` of a flight by the map."""
 
 import csv
-import html
 import io
 from pathlib import Path
 
 import numpy as np
 
+from edgeslam_torch.eval.inputs.run_folder import number
 from edgeslam_torch.eval.metrics.align import travelled
-from edgeslam_torch.eval.report.line_drawings import chart, view
-from edgeslam_torch.eval.report.words import number
+from edgeslam_torch.eval.report.line_drawings import chart, table, view
 from edgeslam_torch.files.plain import open_plain
 
 _MOMENTS = "moments.csv"
@@ -25,14 +24,14 @@ def flight_section(folder: Path | None) -> str:
     rows = [] if folder is None else _rows(folder / _MOMENTS)
     if folder is None or not rows:
         return ""
-    table = {
+    columns = {
         name: np.array([number(row.get(name)) for row in rows]) for name in ("stamp_s", "x_m", "y_m", "clearance_m")
     }
-    good = np.isfinite(table["stamp_s"]) & np.isfinite(table["x_m"]) & np.isfinite(table["y_m"])
+    good = np.isfinite(columns["stamp_s"]) & np.isfinite(columns["x_m"]) & np.isfinite(columns["y_m"])
     if good.sum() < 2:
         return ""
     rows = [row for row, ok in zip(rows, good, strict=True) if ok]
-    stamps, x, y, clearance = (table[name][good] for name in ("stamp_s", "x_m", "y_m", "clearance_m"))
+    stamps, x, y, clearance = (columns[name][good] for name in ("stamp_s", "x_m", "y_m", "clearance_m"))
     seconds, way = stamps - stamps[0], np.stack([x, y], axis=1)
     exits = [line for row in _rows(folder / _EXITS, _EXIT_NEEDED) if (line := _across(row)) is not None]
     drawing = view([way, *exits], [_WAY, *[_EXIT] * len(exits)], "m")
@@ -83,9 +82,7 @@ def _events(rows: list[dict[str, str]], seconds: np.ndarray) -> str:
         state = (row["phase"], row["danger"])
         if state != before:
             place = f"({number(row['x_m']):.1f}, {number(row['y_m']):.1f})"
-            cells = (f"{t:.1f}", place, row["phase"], row["danger"], row["why"])
-            out.append("<tr>" + "".join(f"<td>{html.escape(cell or '')}</td>" for cell in cells) + "</tr>")
+            out.append([f"{t:.1f}", place, *(row[name] or "" for name in ("phase", "danger", "why"))])
         before = state
-    head = "<tr><th>s</th><th>at [m]</th><th>doing</th><th>kept from it by</th><th>order</th></tr>"
     left = f'<p class="note">and {len(out) - _MOST_EVENTS} more</p>' if len(out) > _MOST_EVENTS else ""
-    return f'<div class="scroll"><table>{head}{"".join(out[:_MOST_EVENTS])}</table></div>{left}'
+    return table(["s", "at [m]", "doing", "kept from it by", "order"], out[:_MOST_EVENTS]) + left

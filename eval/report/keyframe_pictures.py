@@ -7,7 +7,7 @@ import numpy as np
 
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.inputs.associate import nearest
-from edgeslam_torch.eval.inputs.run_folder import RunFolder
+from edgeslam_torch.eval.inputs.run_folder import RunFolder, record
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import load_camera
@@ -90,10 +90,9 @@ def draw_edges(image: np.ndarray, camera: Camera, T_c_w: FloatArray, cloud: Poin
 
 
 def _entries(run: RunFolder) -> list[ImageEntry]:
-    source, folder = run.summary.get("source"), run.source
-    if not isinstance(source, dict) or folder is None:
+    kind, folder = str(record(run.summary.get("source")).get("kind")), run.source
+    if folder is None:
         return []
-    kind = str(source.get("kind"))
     if kind == "images":
         return images.list_image_folder(folder)[0]
     layout = layout_of(folder)

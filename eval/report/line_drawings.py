@@ -1,5 +1,6 @@
-"""Paths and curves as SVG, for pages without scripts."""
+"""Paths and curves as SVG, and tables, for pages without scripts."""
 
+import html
 import math
 from collections.abc import Sequence
 
@@ -50,6 +51,13 @@ def chart(x: FloatArray, y: FloatArray, colour: str, label: str) -> str:
     )
     size = f'viewBox="0 0 {_CHART_WIDTH} {_CHART_HEIGHT}"'
     return f'<svg class="curve" {size} role="img">{axis}{_line(xy, colour)}{texts}</svg>'
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of texts below its titles."""
+    first = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
+    rest = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f'<div class="scroll"><table><tr>{first}</tr>{rest}</table></div>'
 
 
 def _line(xy: FloatArray, colour: str) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_keyframe, open_run
+from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_keyframe, number, open_run
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run, finite
 from edgeslam_torch.eval.report import words
@@ -154,7 +154,7 @@ def _payload(
         "inliers": table.column("inliers"),
         "cameras": table.cameras(),
         "fov": [0.62, 0.46],
-        "scale": table.scale(words.scale_note(run.summary)),
+        "scale": table.scale(words.scale_note(run)),
         "stages": table.stages(),
         "truth": None if score is None else _truth_in_run(score, turn),
         "error": None if score is None else _error(score, begin),
@@ -178,7 +178,7 @@ class _StatusTable:
 
     def column(self, name: str) -> list[float | None] | None:
         """Numbers of a column, None where missing; None when the file lacks it."""
-        values = [words.number(r.get(name)) for r in self.rows]
+        values = [number(r.get(name)) for r in self.rows]
         if not any(np.isfinite(values)):
             return None
         return [round(v, 5) if np.isfinite(v) else None for v in values]
@@ -209,7 +209,7 @@ class _StatusTable:
         names = [n for n in (self.all_rows[0] if self.all_rows else {}) if n.endswith("_ms")]
         out = []
         for name in names:
-            values = np.array([words.number(r.get(name)) for r in self.all_rows])
+            values = np.array([number(r.get(name)) for r in self.all_rows])
             values = values[np.isfinite(values) & (values > 0)]
             if len(values):
                 label = "whole step" if name == "step_ms" else name.removesuffix("_ms").replace("_", " ")
@@ -222,7 +222,7 @@ class _StatusTable:
         """Stretches that were not plainly tracked: from, to, frames, status, reason."""
         out: list[list[Any]] = []
         for row in self.all_rows:
-            stamp, status, reason = words.number(row.get("stamp_s")), row.get("status", ""), row.get("reason", "")
+            stamp, status, reason = number(row.get("stamp_s")), row.get("status", ""), row.get("reason", "")
             if status == "tracked" and not reason:
                 out.append([])
                 continue

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported
+from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported, number, record
 from edgeslam_torch.eval.metrics.align import travelled
 from edgeslam_torch.eval.metrics.run_score import RunScore
 
@@ -17,20 +17,6 @@ _LEADING = re.compile(
     r"(?:[^/\\\n:;,'\"<>|]*[^\s/\\:;,'\"<>|][/\\])*"
 )
 """A path from the root or from folders above, up to its last name; folders may have spaces inside their names."""
-
-
-def number(value: object) -> float:
-    """A value of a file that may hold anything as a number; NaN if it is none, or not finite."""
-    try:
-        found = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError):
-        return math.nan
-    return found if math.isfinite(found) else math.nan
-
-
-def record(value: object) -> dict[str, Any]:
-    """The same as a record; empty if it is none."""
-    return value if isinstance(value, dict) else {}
 
 
 def _count(value: object) -> int:
@@ -72,7 +58,7 @@ def story(run: RunFolder, score: RunScore | None) -> str:
             sentences.append(f"{_count(summary.get(key))} of them were {what}.")
     if run.status:
         sentences += _tracking(run, frames)
-    sentences += [_scale_sentence(summary), _pieces_sentence(summary), _found_again_sentence(summary)]
+    sentences += [_scale_sentence(run), _pieces_sentence(summary), _found_again_sentence(summary)]
     if score is not None:
         sentences.append(
             f"Against ground truth the camera is off by {_length(score.ate_sim3_m)} (RMSE after scaling; a camera that "
@@ -129,8 +115,7 @@ _ON_TILES = {
 def figures(run: RunFolder, score: RunScore | None) -> list[Value]:
     """What the pages show of a run in numbers."""
     summary, frames = run.summary, _offered(run)
-    scale, counts = record(summary.get("scale")), record(summary.get("map"))
-    sigma = number(scale.get("sigma")) / (number(scale.get("value")) or math.nan)
+    counts = record(summary.get("map"))
     ate_m, se3_m, rotation_deg, map_m = [math.nan] * 4
     if score is not None:
         ate_m, rotation_deg = score.ate_sim3_m, score.rotation_deg
@@ -144,7 +129,7 @@ def figures(run: RunFolder, score: RunScore | None) -> list[Value]:
         ("frames", frames or len(run.trajectory), 0, ""),
         ("frames tracked", 100.0 * run.trusted_frames / frames if frames and run.status else math.nan, 1, "%"),
         ("times lost", number(summary.get("lost_events")), 0, ""),
-        ("scale, 1 sigma", 100 * sigma if scale.get("units") == "metres" else math.nan, 1, "%"),
+        ("scale, 1 sigma", 100 * run.scale_sigma if run.units == "metres" else math.nan, 1, "%"),
         ("up, 1 sigma", number(record(summary.get("up")).get("sigma_deg")), 1, "\u00b0"),
         ("length of the path", float(travelled(run.trajectory.positions)[-1]), 2, unit(run)),
         ("keyframes", number(counts.get("keyframes")), 0, ""),
@@ -179,11 +164,11 @@ def foot(run: RunFolder) -> str:
     return ", ".join(parts) + "."
 
 
-def scale_note(summary: dict[str, Any]) -> str:
+def scale_note(run: RunFolder) -> str:
     """Where the scale comes from."""
-    if not isinstance(scale := summary.get("scale"), dict):
+    if not run.scale:
         return ""
-    source = str(scale.get("source", "none"))
+    source = str(run.scale.get("source", "none"))
     return "No source of metric scale." if source == "none" else f"Source: {source.replace('+', ' and ')}."
 
 
@@ -233,13 +218,13 @@ def keyframe_label(stem: str, begin: float) -> str:
     return f"{value - begin:.2f} s" if is_stamp else stem.replace("_", " ")
 
 
-def _scale_sentence(summary: dict[str, Any]) -> str:
-    if not isinstance(scale := summary.get("scale"), dict):
+def _scale_sentence(run: RunFolder) -> str:
+    if not run.scale:
         return ""
-    value, sigma, source = number(scale.get("value")), number(scale.get("sigma")), str(scale.get("source", "none"))
-    if scale.get("units") == "arbitrary" or not math.isfinite(sigma) or not value:
+    if run.units == "arbitrary" or not math.isfinite(run.scale_sigma):
         return "No source determined the metric scale, so lengths are in arbitrary units."
-    known = f"{100 * sigma / value:.1f} % (1 sigma) from {source.replace('+', ' and ')}"
+    source = str(run.scale.get("source", "none")).replace("+", " and ")
+    known = f"{100 * run.scale_sigma:.1f} % (1 sigma) from {source}"
     return f"Lengths are in metres, with the scale known to {known}."
 
 

@@ -1,19 +1,18 @@
 """Map accuracy and completeness against measured depth, on a rendered wall whose distances are known."""
 
-import cv2
 import numpy as np
 import pytest
+from rendered import RenderedFlight
 from scipy.spatial import cKDTree
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import open_dataset
-from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.eval.metrics.align import Alignment
 from edgeslam_torch.eval.metrics.edge_map_score import SurfaceTruth, build_surface, score_map
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.layouts.seven_scenes import T_COLOUR_DEPTH
 from edgeslam_torch.readers.sequence import register_depth
+from edgeslam_torch.types import Frame
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 NEAR_M, FAR_M = 1.5, 3.0
@@ -22,28 +21,16 @@ NEAR_M, FAR_M = 1.5, 3.0
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A camera slides along x in front of a wall at 3 m with a white board at 1.5 m before it."""
-    out = tmp_path_factory.mktemp("wall")
-    (out / "rgb").mkdir()
-    (out / "depth").mkdir()
-    stamps = 10.0 + np.arange(8) / 10.0
     T = np.tile(np.eye(4), (8, 1, 1))
     T[:, 0, 3] = np.linspace(-0.1, 0.1, 8)
-    write_tum(Trajectory(stamps, T), out / "groundtruth.txt")
-    save_camera(out / "camera.yaml", CAMERA)
-    for name in ("rgb", "depth"):
-        comment = "# metres = value / 5000\n" if name == "depth" else "# images\n"
-        rows = "".join(f"{t:.6f} {name}/{t:.6f}.png\n" for t in stamps)
-        (out / f"{name}.txt").write_text(comment + rows)
     u, v = np.meshgrid(np.arange(160), np.arange(120))
-    for t, pose in zip(stamps, T, strict=True):
-        x = (u - CAMERA.cx) / CAMERA.fx * NEAR_M + pose[0, 3]
-        y = (v - CAMERA.cy) / CAMERA.fy * NEAR_M
-        board = (np.abs(x) < 0.4) & (np.abs(y) < 0.3)
-        cv2.imwrite(str(out / "rgb" / f"{t:.6f}.png"), np.where(board, 220, 40).astype(np.uint8))
-        depth = np.where(board, NEAR_M, FAR_M)
-        depth[:6, :6] = 0.0
-        cv2.imwrite(str(out / "depth" / f"{t:.6f}.png"), np.round(depth * 5000).astype(np.uint16))
-    return out
+    y = (v - CAMERA.cy) / CAMERA.fy * NEAR_M
+    boards = [(np.abs((u - CAMERA.cx) / CAMERA.fx * NEAR_M + x) < 0.4) & (np.abs(y) < 0.3) for x in T[:, 0, 3]]
+    frames = [Frame(i, 10.0 + i / 10.0, np.where(board, 220, 40).astype(np.uint8)) for i, board in enumerate(boards)]
+    depths = [np.where(board, NEAR_M, FAR_M) * ((u >= 6) | (v >= 6)) for board in boards]
+    return RenderedFlight(CAMERA, frames, depths, T, None).write(
+        tmp_path_factory.mktemp("data") / "wall", depth_every=1
+    )
 
 
 @pytest.fixture(scope="module")

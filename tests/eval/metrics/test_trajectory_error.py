@@ -291,6 +291,8 @@ def waves(t):
         (lambda t: at(t, t.positions[:, [1, 0, 2]]), "mirrored", "world-to-camera"),
         (lambda t: at(t, t.positions * [-1, 1, 1]), "mirrored", "world-to-camera"),
         (lambda t: at(t, 1000.0 * t.positions), "millimetres", "centimetres"),
+        (lambda t: turned(t, t.T_w_c[:, :3, :3] @ WORLD[:3, :3]), "different bodies", "inverted"),
+        (lambda t: replace(t, stamps_s=t.stamps_s + 0.024 * (np.arange(len(t)) % 5 > 1)), "found a partner", "unit"),
         (lambda t: replace(t, stamps_s=1e3 * (t.stamps_s + 1.37)), "--offset -1.3", "nanoseconds"),
         (lambda t: t.take(np.array([10, 90, 150])), "only 3 poses", "mirrored"),
         (lambda t: at(t, waves(t.stamps_s)), "another sequence", "drifted"),

@@ -2,45 +2,17 @@
 
 import re
 import shutil
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from browser import PROGRAM, Browser
+from pages import Page
 from summaries import with_summary
 
 from edgeslam_torch import cli
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory, write_tum
 from edgeslam_torch.eval.report import line_drawings
 from edgeslam_torch.eval.report.comparison import write_comparison
-
-
-class Cells(HTMLParser):
-    """Rows of all tables, and all text."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.rows = []
-        self.text = ""
-        self.tags = []
-        self._cell = False
-        self.feed(page.read_text(encoding="utf-8"))
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        if tag == "tr":
-            self.rows.append([])
-        self._cell = tag in ("td", "th")
-        if self._cell:
-            self.rows[-1].append("")
-
-    def handle_endtag(self, tag):
-        self._cell = False
-
-    def handle_data(self, data):
-        self.text += data
-        if self._cell:
-            self.rows[-1][-1] += data
 
 
 def _changed(folder, turn=0.7, size=2.0, **summary):
@@ -65,7 +37,7 @@ def two(tmp_path, run_folder):
 
 
 def test_figures_and_their_difference(two, tmp_path):
-    rows = {row[0]: row[1:] for row in Cells(write_comparison(*two, tmp_path / "c.html")).rows}
+    rows = {row[0]: row[1:] for row in Page(write_comparison(*two, tmp_path / "c.html")).rows}
     assert rows["frames per second"] == ["24.5", "20.0", "-4.5"]
     a, b = (float(text.split()[0]) for text in rows["length of the path"][:2])
     assert b == pytest.approx(2.0 * a, rel=1e-3)
@@ -77,14 +49,14 @@ def test_figures_and_their_difference(two, tmp_path):
 def test_page_may_be_passed_on_and_hostile_names_stay_text(two, tmp_path):
     bad = two[1].rename(tmp_path / "<script>alert(1)<&script>")
     page = write_comparison(two[0], bad, tmp_path / "c.html")
-    parsed, text = Cells(page), page.read_text()
-    assert "script" not in parsed.tags and "<script>alert(1)" in parsed.text
+    parsed, text = Page(page), page.read_text()
+    assert "script" not in parsed.tags and "<script>alert(1)" in parsed.texts["h1"]
     assert str(tmp_path) not in text and "secret" not in text
     assert not re.findall(r'(?:src|href)="(?!data:)', text) and "http" not in text
 
 
 def test_one_path_is_aligned_to_the_other(two, tmp_path):
-    text = Cells(write_comparison(*two, tmp_path / "c.html")).text
+    text = Page(write_comparison(*two, tmp_path / "c.html")).texts["p"]
     found = re.search(
         r"B is aligned to A by (\d+) common frames .* scaled by ([\d.]+)\); .* distance is (\S+) m RMS", text
     )
@@ -95,7 +67,7 @@ def test_one_path_is_aligned_to_the_other(two, tmp_path):
 def test_runs_without_common_frames_are_drawn_apart(two, tmp_path):
     run = read_trajectory(two[1] / "trajectory.txt")
     write_tum(Trajectory(run.stamps_s + 1e6, run.T_w_c, "b"), two[1] / "trajectory.txt")
-    assert "no frames in common" in Cells(write_comparison(*two, tmp_path / "c.html")).text
+    assert "no frames in common" in Page(write_comparison(*two, tmp_path / "c.html")).texts["p"]
 
 
 def test_command_writes_reports_and_comparison(two, tmp_path, capsys):

@@ -1,12 +1,11 @@
 """Contents of ``report.html``, also for hostile names and numbers."""
 
-import json
 import shutil
-from html.parser import HTMLParser
 
 import cv2
 import numpy as np
 import pytest
+from pages import Page
 from summaries import with_summary
 
 from edgeslam_torch import open_source
@@ -29,28 +28,6 @@ NAMES = (
 )
 
 
-class Page(HTMLParser):
-    """Title, number of elements of each kind and texts of scripts by id, as a browser's parser splits them."""
-
-    def __init__(self, path):
-        super().__init__()
-        self.text = {}
-        self.tags = []
-        self._in = ""
-        self.feed(path.read_text(encoding="utf-8"))
-        self.data = json.loads(self.text["data"])
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self._in = dict(attrs).get("id") or tag
-
-    def handle_endtag(self, tag):
-        self._in = ""
-
-    def handle_data(self, data):
-        self.text[self._in] = self.text.get(self._in, "") + data
-
-
 @pytest.fixture
 def run(run_folder, tmp_path):
     run_folder(tmp_path / "run", points=100)
@@ -63,10 +40,10 @@ def test_no_text_of_a_run_breaks_the_page(run):
         page = Page(write_report(with_summary(run, source={"name": name, "path": f"/nowhere/{name}"})))
         shown = name.replace("\udcff", "?")
         assert page.data["title"] == shown
-        assert page.text["title"] == f"{shown}, EdgeSLAM-Torch"
+        assert page.texts["title"] == f"{shown}, EdgeSLAM-Torch"
         assert page.tags == plain.tags, "the name made elements"
-        assert page.text["edges-data"] == plain.text["edges-data"]
-        assert page.text["script"] == plain.text["script"]
+        assert page.texts["edges-data"] == plain.texts["edges-data"]
+        assert page.texts["script"] == plain.texts["script"]
     for name in NAMES[:5]:
         (run / "config.toml").write_text(name)
         (run / "status.csv").write_text(f'stamp_s,status,reason\n100.0,lost,"{name}"\n')
@@ -76,9 +53,9 @@ def test_no_text_of_a_run_breaks_the_page(run):
 
 
 def test_a_large_map_is_shown_by_a_part_of_its_points(run, monkeypatch):
-    whole = len(Page(write_report(run)).text["edges-data"])
+    whole = len(Page(write_report(run)).texts["edges-data"])
     monkeypatch.setattr("edgeslam_torch.eval.report.page.MAX_POINTS", 40)  # of 100
-    assert len(Page(write_report(run)).text["edges-data"]) == pytest.approx(0.4 * whole, rel=0.02)
+    assert len(Page(write_report(run)).texts["edges-data"]) == pytest.approx(0.4 * whole, rel=0.02)
 
 
 PIECES = [
