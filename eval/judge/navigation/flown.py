@@ -1,6 +1,6 @@
 """Cases of judged flights and their results."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 
@@ -63,7 +63,11 @@ class Flown:
     track_w: list[list[float]] = field(default_factory=list)
     """``(N, 3)`` true path, for a top view."""
 
+    def record(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
     @classmethod
     def of_record(cls, record: dict[str, Any]) -> "Flown":
-        """Of its ``asdict``, from JSON."""
+        """From JSON."""
         return cls(**{**record, "case": Case(**record["case"]), "dangers": tuple(record["dangers"])})

@@ -56,7 +56,7 @@ def run_flight(case: dict[str, Any], folder: Path) -> dict[str, Any]:
     from edgeslam_torch.eval.judge.navigation.over_udp import fly_over_udp
 
     given = Case(**case["flight"])
-    return {"flown": asdict((fly_over_udp if given.perception == "udp" else fly)(given))}
+    return {"flown": (fly_over_udp if given.perception == "udp" else fly)(given).record()}
 
 
 def _flown(case: Case, found: dict[str, Any] | None, error: str) -> Flown:

@@ -1,7 +1,6 @@
 """The judge of flights."""
 
 import json
-from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -43,7 +42,7 @@ def test_flights_are_kept_and_one_that_fails_ends_no_other(tmp_path, monkeypatch
     """A world that does not exist is an error of that flight; what was flown before stays."""
     good, bad, said = Case("blank_walls", 0), Case("nowhere", 0), []
     track = {"track_w": [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]], "dangers": ("drift",)}
-    result = {"flown": asdict(flown(True, **track))}
+    result = {"flown": flown(True, **track).record()}
     monkeypatch.setattr(Task, "result", lambda task: result if task.name == good.name else None)
     flights = judge_flights([bad, good], tmp_path, 1, said.append)
     assert [f.reached for f in flights] == [False, True] and flights[1].case == good
