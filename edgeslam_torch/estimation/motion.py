@@ -20,13 +20,14 @@ from edgeslam_torch.estimation.orientation import Orientation
 from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.estimation.scale.belief import disagreement
 from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
+from edgeslam_torch.estimation.sensors.height import climb
 from edgeslam_torch.estimation.sensors.imu import REACH_S as IMU_REACH_S
 from edgeslam_torch.estimation.sensors.imu import Imu
 from edgeslam_torch.estimation.snapshot import Present, Snapshot
 from edgeslam_torch.estimation.telemetry.comparison import Comparison
 from edgeslam_torch.estimation.telemetry.delay import DelaySearch
 from edgeslam_torch.estimation.telemetry.remembered import Remembered
-from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, SensorGate
+from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, Reading, SensorGate
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory, VisualPose
 from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
@@ -71,6 +72,8 @@ class MotionFusion:
         self.orientation = Orientation(self.flight, given)
         self.metres = ScaleEstimator(config, focal_sigma)
         self.imu = Imu(ImuModel() if imu is None else imu)
+        self._sample: TelemetrySample | None = None
+        """The newest state message."""
         self._comparison = Comparison(self.flight)
         self._filter = FilterFeed(config, given)
         self._fitted_s = -math.inf
@@ -84,7 +87,11 @@ class MotionFusion:
         for sample in self.flight.track.add(samples):
             if np.isfinite(sample.rpy_rad).all():
                 self.orientation.note_attitude(sample.stamp_s)
-            self._filter.add_telemetry(sample, self.metres.fit.shortfall_m_s)
+            before, self._sample = self._sample, sample
+            ranged = (
+                climb(before, sample, self.config.velocity_step_m_s) if self._trust.height(Reading.TOF) else math.nan
+            )
+            self._filter.add_telemetry(sample, self.metres.fit.shortfall_m_s, ranged)
 
     def add_imu(self, readings: Sequence[ImuReadings]) -> None:
         """IMU readings in temporal order."""

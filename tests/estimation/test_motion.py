@@ -125,6 +125,27 @@ def on_the_spot(motion, t, z, yaw):
     return replace(motion, stamps_s=t, T_w_c=T_w_b @ T_B_C)
 
 
+@pytest.mark.parametrize("ranged", [True, False])
+def test_a_creeping_climb_without_images_is_seen_by_the_range_sensor(fused, ranged):
+    """Four centimetres a second are zero in whole decimetres."""
+    motion, found = swinging(18.0), []
+    blind_s = np.clip(motion.stamps_s - 12.0, 0.0, None)
+    T_w_c = np.where(blind_s[:, None, None] > 0.0, motion.T_w_c[240], motion.T_w_c)
+    T_w_c[:, 2, 3] += 0.04 * blind_s
+    faults = TelemetryFaults(video_delay_s=0.0, velocity_noise_m_s=0.0, velocity_walk=0.0)
+
+    def feed(fusion, *given):
+        def each(t, i):
+            found.extend([fusion.predict(t).T_w_c[:3, 3]] if t > 13.0 else [])
+
+        replay(fusion, *given, tracked=lambda t: t <= 12.0, each=each)
+
+    change = (lambda sample: sample) if ranged else without_heights
+    _, gauge = fused(replace(motion, T_w_c=T_w_c), faults, feed=feed, change=change)
+    risen = gauge.scale * float(gauge.T_m_w[:3, 2] @ (found[-1] - found[0]))
+    assert risen == pytest.approx(0.2 if ranged else 0.0, abs=0.04)
+
+
 def test_height_changes_alone_tell_the_scale_of_a_climb(fused):
     t = np.arange(0.0, 20.0, 0.05)
     fusion, gauge = fused(on_the_spot(swinging(1.0), t, 1.0 + 0.5 * np.sin(0.6 * t), 0.0 * t))

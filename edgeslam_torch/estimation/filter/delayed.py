@@ -67,12 +67,15 @@ class BufferedEkf:
         """Time of the newest event, ``None`` before the first."""
         return self._events[-1].key[0] if self._events else None
 
-    def add_telemetry(self, sample: TelemetrySample) -> None:
-        """Velocity (predicts up to the next reading) and attitude of one state message; NaN fields are left out."""
+    def add_telemetry(self, sample: TelemetrySample, ranged: bool = False) -> None:
+        """Velocity (predicts up to the next reading) and attitude of one state message; NaN fields are left out.
+
+        ``ranged``: heights gave the vertical velocity.
+        """
         if math.isfinite(sample.stamp_s):
             self.telemetry_s = max(self.telemetry_s, sample.stamp_s)
             start = (np.zeros(3), sample.rpy_rad) if np.isfinite(sample.rpy_rad).all() else None
-            self._insert(_Event((sample.stamp_s, _TELEMETRY), lambda ekf: _read(ekf, sample), sample, start))
+            self._insert(_Event((sample.stamp_s, _TELEMETRY), lambda ekf: _read(ekf, sample, ranged), sample, start))
 
     def see(self, stamp_s: float) -> None:
         """Start vision at an unmeasured pose: the origin of the increments that follow."""
@@ -205,10 +208,10 @@ class BufferedEkf:
         return ekf
 
 
-def _read(ekf: Ekf, sample: TelemetrySample) -> str:
+def _read(ekf: Ekf, sample: TelemetrySample, ranged: bool) -> str:
     """Apply a state message."""
     if math.isfinite(float(sample.velocity_m_s.sum())):
-        ekf.velocity = sample.velocity_m_s
+        ekf.velocity, ekf.ranged = sample.velocity_m_s, ranged
     ekf.read_rate = _rate(ekf, sample)
     if math.isfinite(sample.battery):
         ekf.battery = sample.battery

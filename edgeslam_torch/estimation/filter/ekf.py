@@ -86,8 +86,10 @@ class Ekf:
         self.refused_in_row = {3: 0, 6: 0}
         """Consecutive refusals of attitude (3 components) and of vision (6)."""
         self.velocity: FloatArray = np.zeros(3)
+        self.ranged = False
         self.battery = math.nan
-        """Of the newest reading; the velocity is interpolated between two."""
+        """Of the newest reading; the velocity is interpolated between two, ``ranged`` where heights give its vertical
+        component, which has no bias."""
         self.read_rpy_rad: FloatArray = np.full(3, math.nan)
         self.read_rate: FloatArray = np.zeros(3)
         self.read_s = math.nan
@@ -170,13 +172,15 @@ class Ekf:
         diagonal[_B] += bias
 
     def _bias(self, velocity_m_s: FloatArray) -> FloatArray:
-        """Velocity bias to subtract from a reading ``(3,)``; zero for zero readings after some time without vision.
+        """Velocity bias to subtract from a reading ``(3,)``; zero for zero readings and for heights after some time
+        without vision.
 
         The bias estimated in flight is mostly quantisation loss; subtracting it from the readings of a hovering drone
         would make it drift.
         """
-        bias = self.x[_B]
-        return bias if self.tau_s < _BLIND_S else np.where(velocity_m_s == 0.0, 0.0, bias)
+        if self.tau_s < _BLIND_S:
+            return self.x[_B]
+        return np.where((velocity_m_s == 0.0) | [False, False, self.ranged], 0.0, self.x[_B])
 
     def update_attitude(self, rpy_rad: FloatArray) -> Outcome:
         """Euler angles from the drone, paper eqs. (11)-(12)."""

@@ -94,9 +94,20 @@ class FilterFeed:
         """Reset the last pose: a new map has another gauge."""
         self._seen = self._delay = self._accumulated = None
 
-    def add_telemetry(self, sample: TelemetrySample, shortfall_m_s: float) -> None:
-        """Add one state message; non-zero velocities are corrected by a truncation loss of ``shortfall_m_s``."""
-        self.ekf.add_telemetry(_corrected(sample, shortfall_m_s))
+    def add_telemetry(self, sample: TelemetrySample, shortfall_m_s: float, climb_m_s: float = math.nan) -> None:
+        """Add one state message.
+
+        Args:
+            sample: The message.
+            shortfall_m_s: Mean truncation loss of its non-zero velocities.
+            climb_m_s: Vertical velocity by heights, which counts instead of the reported one: whole decimetres a second
+                lose half a metre of height in ten seconds.
+        """
+        corrected = _corrected(sample, shortfall_m_s)
+        ranged = math.isfinite(climb_m_s)
+        if ranged:
+            corrected = replace(corrected, velocity_m_s=np.append(corrected.velocity_m_s[:2], climb_m_s))
+        self.ekf.add_telemetry(corrected, ranged)
 
     def see(self, visual: VisualPose, scale: ScaleEstimate, delay: Delay) -> None:
         """Update the filter with a tracked frame, at metres per map unit and the video's delay behind telemetry."""

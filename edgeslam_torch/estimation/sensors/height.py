@@ -1,12 +1,16 @@
 """Heights of the drone's SDK: range sensor, SDK height, barometer, above a floor that has steps."""
 
+import math
+
 import numpy as np
 
 from edgeslam_torch.estimation.sensors.rows import Rows
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.noise import DELAY_S, HEIGHT_M, HEIGHT_MEMORY_S, TILT_RAD
-from edgeslam_torch.types import FloatArray, IntArray
+from edgeslam_torch.types import FloatArray, IntArray, TelemetrySample
 
+_PAUSE_S = 0.35
+"""Maximum time between two messages whose heights give a velocity."""
 FLOOR_M = 30.0
 """Uninformative prior on the floor's level."""
 
@@ -22,6 +26,23 @@ def floor_segments(stamp_s: FloatArray, z_m: FloatArray, z_predicted_m: FloatArr
     jump = np.abs(np.diff(z_m) - np.diff(z_predicted_m)) > step_m
     hole = np.diff(stamp_s) > 0.5
     return np.concatenate([[0], np.cumsum(jump | hole)]).astype(np.int64)
+
+
+def climb(before: TelemetrySample | None, sample: TelemetrySample, step_m_s: float) -> float:
+    """Vertical velocity [m/s] by two successive readings of the range sensor; NaN without them, and across a floor
+    step. SDK height and barometer are too coarse for it.
+
+    Args:
+        before: The state message before.
+        sample: The present one.
+        step_m_s: Resolution of the reported velocity.
+    """
+    if before is None or not 0.0 < sample.stamp_s - before.stamp_s < _PAUSE_S:
+        return math.nan
+    pause_s = sample.stamp_s - before.stamp_s
+    found = (sample.tof_m - before.tof_m) / pause_s
+    error = step_m_s + 3.0 * math.sqrt(2.0) * HEIGHT_M["tof"] / pause_s
+    return found if abs(found - float(sample.velocity_m_s[2])) < error else math.nan
 
 
 def heights(
