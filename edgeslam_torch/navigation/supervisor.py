@@ -26,8 +26,7 @@ BACK_S = 1.5
 LAND_S = 10.0
 """Duration of a danger after which the drone lands."""
 UNSURE_LAND_S = 30.0
-"""The same for an uncertain scale: time for seven vertical oscillations, which make the scale observable in this map
-or, after eight seconds without success, in the next one (`flying/perception/map_reset.py`)."""
+"""The same for an uncertain scale: time for seven vertical oscillations, which make the scale observable."""
 _BACK_M, _BACK_M_S = 1.0, 0.25
 """Distance and mean speed of backing up; without frames only telemetry measures the distance."""
 SCALE_SIGMA = 0.10

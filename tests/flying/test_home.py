@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.flying.perception.home import GROUND_M, TAKE_OFF, Home, Place, metres_per_unit
+from edgeslam_torch.flying.perception.home import GROUND_M, Home, metres_per_unit
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.types import FrameStatus, ScaleEstimate, SlamOutput
@@ -35,22 +35,6 @@ def test_the_first_body_is_the_origin_on_the_floor_and_the_second_where_it_flew(
     np.testing.assert_allclose(bodies[0], pose(0.0, [0.0, 0.0, GROUND_M]), atol=1e-12)
     step = pose(-30.0, [0, 0, 0])[:3, :3] @ (second[:3, 3] - first[:3, 3])
     np.testing.assert_allclose(bodies[1], pose(45.0, step + [0.0, 0.0, GROUND_M]), atol=1e-12)
-
-
-def test_a_map_that_begins_in_the_air_lies_in_the_same_world():
-    """Its first picture is taken after half a turn, 1.2 m up: bodies are where they are to the take-off."""
-    take_off, begins, later = (
-        pose(30.0, [2.0, -1.0, GROUND_M]),
-        pose(120.0, [2.1, -0.8, 1.2]),
-        pose(75.0, [3.0, 0.5, 1.6]),
-    )
-    there = se3.inverse(pose(30.0, [2.0, -1.0, 0.0]))
-    place = Place((there @ begins)[:3, 3], np.deg2rad(90.0))
-    elsewhere = pose(-70.0, [5.0, 4.0, 3.0])  # the axes of the new map
-    home = Home.of(published(elsewhere @ begins), METRES, T_B_C, place)
-    bodies = home.poses(published(elsewhere @ later)) @ se3.inverse(T_B_C)
-    np.testing.assert_allclose(bodies, there @ later, atol=1e-12)
-    np.testing.assert_allclose((there @ take_off)[:3, 3], TAKE_OFF.position_m, atol=1e-12)
 
 
 def output(scale, sigma=0.02, metric=True):

@@ -2,19 +2,17 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from edgeslam_torch.flying.perception.home import GROUND_M, Home
-from edgeslam_torch.flying.perception.map_reset import PATIENCE_S
+from edgeslam_torch.flying.perception.home import Home
 from edgeslam_torch.flying.perception.slam_perception import SlamPerception, _contradicted
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD, camera_on_body
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.sites.build import named_site
-from edgeslam_torch.types import DepthMap, ScaleEstimate, TelemetrySample
+from edgeslam_torch.types import DepthMap, ScaleEstimate
 
 CAMERA = PRESETS["tello"].scaled(480, 360)
 DISTANCE_M = 1.5
@@ -216,47 +214,3 @@ def test_scale_in_doubt_raises_its_sigma(perception):
     assert perception.state(1.0).scale_sigma == pytest.approx(0.02)
     perception._bias._outliers, perception._bias._off_log = 5, np.log(3.0)
     assert perception.state(1.0).scale_sigma == pytest.approx(2.0, rel=0.01)
-
-
-class Slam:
-    """A SLAM with the network's scale only, which records its inputs."""
-
-    made: ClassVar[list] = []
-
-    def __init__(self, camera, config, realtime):
-        self.frames, self.closed = [], False
-        self.made.append(self)
-
-    def step(self, frame, telemetry):
-        self.frames.append((frame.index, len(telemetry)))
-        lost, guess = SimpleNamespace(state="lost"), ScaleEstimate(2.0, 0.9, "depth")
-        told = {"metric": True, "scale": guess, "health": lost, "unit": 1.0, "revision": 0, "stamp_s": frame.stamp_s}
-        return SimpleNamespace(T_w_c=np.eye(4), **told)
-
-    def trajectory(self):
-        return np.zeros(len(self.frames)), np.repeat(np.eye(4)[None], len(self.frames), axis=0)
-
-    def pose_now(self, now_s, samples):
-        return None
-
-    def close(self):
-        self.closed = True
-
-
-def test_a_map_without_metric_scale_in_flight_is_reset(monkeypatch):
-    monkeypatch.setattr("edgeslam_torch.flying.perception.slam_perception.EdgeSlam", Slam)
-    Slam.made.clear()
-    perception, revisions = SlamPerception(CAMERA), []
-    for k, now_s in enumerate(np.arange(0.0, 1.5 * PATIENCE_S, 1 / 15)):
-        if k % 2 == 0:
-            perception.add_telemetry(TelemetrySample(now_s, np.zeros(3), np.array([0.0, 0.0, 0.3]), 0.9))
-        perception.seen(bare_wall(), now_s, now_s)
-        revisions.append(perception._changes)
-        assert perception.state(now_s).p_w[2] == pytest.approx(GROUND_M if len(Slam.made) == 1 else 0.9 + GROUND_M)
-    first, second = Slam.made
-    assert first.closed and not second.closed
-    assert len(first.frames) == pytest.approx(15 * PATIENCE_S, abs=3)
-    assert second.frames[0] == (0, 1), "it begins anew, and is told which way is up"
-    assert len(set(revisions)) == 2, "a pilot forgets what it was told before"
-    late = SimpleNamespace(picture=perception._first - 1, T_w_c=np.eye(4), stamp_s=now_s)
-    assert perception._map_update(late) is None and not perception._sent_views, "a view of the old map that comes late"

@@ -16,18 +16,6 @@ _OFF = 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Position and heading of a body in the drone's world."""
-
-    position_m: FloatArray
-    """``(3,)``"""
-    yaw_rad: float
-
-
-TAKE_OFF = Place(np.array([0.0, 0.0, GROUND_M]), 0.0)
-
-
-@dataclass(frozen=True, slots=True)
 class Home:
     """Similarity from the SLAM's output world ``w`` to the drone's world: ``scale R p + shift_m``."""
 
@@ -39,21 +27,20 @@ class Home:
     """``(3,)``."""
 
     @staticmethod
-    def of(T_w_first: FloatArray, scale: float, T_b_c: FloatArray, began: Place = TAKE_OFF) -> "Home":
-        """The world in which the body of the first frame is at ``began``.
+    def of(T_w_first: FloatArray, scale: float, T_b_c: FloatArray) -> "Home":
+        """The world in which the body of the first frame stands at the origin.
 
         Args:
             T_w_first: ``T_w_c`` of the SLAM's first frame ``(4, 4)``, in output units.
             scale: Metres per output unit.
             T_b_c: Camera on the body ``(4, 4)`` [m].
-            began: Pose of the body at the first frame in this world.
         """
         T_w_b = T_w_first @ se3.inverse(T_b_c)
-        yaw = math.atan2(T_w_b[1, 0], T_w_b[0, 0]) - began.yaw_rad
+        yaw = math.atan2(T_w_b[1, 0], T_w_b[0, 0])
         c, s = math.cos(yaw), math.sin(yaw)
         R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         body_m = scale * (R @ T_w_first[:3, 3]) + R @ (T_w_b[:3, 3] - T_w_first[:3, 3])
-        return Home(R, scale, began.position_m - body_m)
+        return Home(R, scale, np.array([0.0, 0.0, GROUND_M]) - body_m)
 
     def poses(self, T_w_c: FloatArray) -> FloatArray:
         """``T_w_c`` ``(..., 4, 4)`` in the drone's world [m]."""

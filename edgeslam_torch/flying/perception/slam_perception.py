@@ -7,8 +7,7 @@ import numpy as np
 
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.estimation.scale.belief import disagreement
-from edgeslam_torch.flying.perception.home import GROUND_M, TAKE_OFF, Home, Place, metres_per_unit
-from edgeslam_torch.flying.perception.map_reset import MapReset
+from edgeslam_torch.flying.perception.home import GROUND_M, Home, metres_per_unit
 from edgeslam_torch.frontend.depth_network import DepthNetwork, open_depth, weights_path
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
@@ -64,8 +63,7 @@ class SlamPerception:
         while width > IMAGE_WIDTH and width % 2 == height % 2 == 0:
             width, height = width // 2, height // 2
         self._camera = camera.scaled(width, height)
-        self._seed, self._realtime = seed, realtime
-        self._map_reset = MapReset()
+        self._slam = EdgeSlam(self._camera, SlamConfig(seed=seed), realtime=realtime)
         self._K_small = self._camera.scaled(width // _STEP, height // _STEP).K
         self._network: DepthNetwork = open_depth(weights_path(_WEIGHTS))
         self._T_b_c = camera_on_body()
@@ -77,16 +75,6 @@ class SlamPerception:
         self._reported_height_m, self._reported_speed_m_s = np.nan, np.nan
         self._revision = self._changes = self._frames = 0
         """The second counts scale changes."""
-        self._begin(self._new_slam(), TAKE_OFF)
-
-    def _new_slam(self) -> EdgeSlam:
-        return EdgeSlam(self._camera, SlamConfig(seed=self._seed), realtime=self._realtime)
-
-    def _begin(self, slam: EdgeSlam, place: Place) -> None:
-        """Start a new map and reset everything that belongs to the old one."""
-        self._slam, self._began = slam, place
-        self._first = self._frames
-        """Number of the map's first frame."""
         self._output: SlamOutput | None = None
         self._home = Home(np.eye(3), 1.0, np.zeros(3))
         self._fit: tuple[NearFit, float, int] | None = None
@@ -100,13 +88,11 @@ class SlamPerception:
         self._sent_views: list[tuple[int, FloatArray]] = []
         """Frames whose views were sent to the planner, the newest of them with their poses as last sent."""
         self._sent_unit, self._sent_revision, self._moved_s = 1.0, 0, -np.inf
-        self._revision = 0
 
     def add_telemetry(self, sample: TelemetrySample) -> None:
         """Process a state message."""
         with self._lock:
             self._samples.append(sample)
-            self._map_reset.add_telemetry(sample)
             if np.isfinite(sample.battery):
                 self._battery = sample.battery
             if np.isfinite(sample.height_m):
@@ -120,10 +106,7 @@ class SlamPerception:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         with self._lock:
             batch = list(self._samples)
-            due = self._map_reset.is_due(arrived_s, self._output is not None and _is_sure(self._output))
-        if due and batch:  # a map's first frame needs gravity
-            self._begin_again()
-        output = self._slam.step(Frame(self._frames - self._first, arrived_s, image), batch)
+        output = self._slam.step(Frame(self._frames, arrived_s, image), batch)
         T_slam = self._slam.trajectory()[1]
         self._frames += 1
         revised, self._revision = output.revision != self._revision, output.revision
@@ -133,7 +116,7 @@ class SlamPerception:
         may_move = depth is not None and captured_s - self._moved_s > _MOVES_EVERY_S
         metres = metres_per_unit(self._metres, output, may_move)
         unit = metres if np.isfinite(metres) else output.unit
-        home = Home.of(T_slam[0], unit / output.unit, self._T_b_c, self._began)
+        home = Home.of(T_slam[0], unit / output.unit, self._T_b_c)
         with self._lock:
             del self._samples[: len(batch)]
             self._output, self._captured_s, self._home = output, captured_s, home
@@ -144,27 +127,18 @@ class SlamPerception:
                 self._shown = home.poses(T_slam), unit, output.revision + self._changes
         return None if depth is None else self._view(depth, home, output.T_w_c, captured_s)
 
-    def _begin_again(self) -> None:
-        """Replace the map; the new SLAM is created outside the lock since that takes tenths of a second."""
-        fresh, given_up = self._new_slam(), self._slam
-        with self._lock:
-            self._changes += self._revision + 1  # positions sent before are of another map
-            self._begin(fresh, self._map_reset.begin())
-        given_up.close()
-
     def state(self, now_s: float, view: View | None = None) -> DroneState:
         """Current state, with a new view if any and the map correction since the last view."""
         with self._lock:
             output, captured_s, home, changes = self._output, self._captured_s, self._home, self._changes
-            slam, began = self._slam, self._began
             samples, battery = list(self._samples), self._battery
             reported_height_m, reported_speed_m_s = self._reported_height_m, self._reported_speed_m_s
-        pose = slam.pose_now(now_s, samples)
+        pose = self._slam.pose_now(now_s, samples)
         if pose is None or output is None or output.health is None:
             return DroneState(
                 now_s,
-                began.position_m,
-                began.yaw_rad,
+                np.array([0.0, 0.0, GROUND_M]),
+                0.0,
                 np.zeros(3),
                 metric=False,
                 tracked=False,
@@ -206,14 +180,12 @@ class SlamPerception:
     def _map_update(self, view: View) -> MapUpdate | None:
         """Correction of the views sent so far at the time of this one, which is added to them."""
         with self._lock:
-            (T_w_c, unit, revision), first = self._shown, self._first
-            if view.picture < first:  # of a map that was replaced meanwhile
-                return None
+            T_w_c, unit, revision = self._shown
             found = None
             if recent := self._sent_views[-MAX_VIEWS:]:
                 sent = [*self._sent_views[:-MAX_VIEWS:_THINNED], *recent]
                 pictures, before = np.array([picture for picture, _ in sent]), np.array([T for _, T in recent])
-                T_w_c = T_w_c[pictures - first]
+                T_w_c = T_w_c[pictures]
                 after = T_w_c[-len(recent) :]
                 late = view.stamp_s - self._moved_s > _MOVES_EVERY_S
                 if revision != self._sent_revision or (late and moves(before, after, CELL_M)):
