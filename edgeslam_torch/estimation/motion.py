@@ -88,10 +88,11 @@ class MotionFusion:
             if np.isfinite(sample.rpy_rad).all():
                 self.orientation.note_attitude(sample.stamp_s)
             before, self._sample = self._sample, sample
-            ranged = (
-                climb(before, sample, self.config.velocity_step_m_s) if self._trust.height(Reading.TOF) else math.nan
-            )
-            self._filter.add_telemetry(sample, self.metres.fit.shortfall_m_s, ranged)
+            ranged_m_s = math.nan
+            # The printed filter takes velocities as they are; those in body axes have no vertical component.
+            if self._trust.height(Reading.TOF) and self.config.velocity_frame != "body" and not self.config.literal:
+                ranged_m_s = climb(before, sample, self.config.velocity_step_m_s)
+            self._filter.add_telemetry(sample, self.metres.fit.shortfall_m_s, ranged_m_s)
 
     def add_imu(self, readings: Sequence[ImuReadings]) -> None:
         """IMU readings in temporal order."""

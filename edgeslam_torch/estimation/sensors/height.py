@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from edgeslam_torch.estimation.sensors.rows import Rows
-from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
+from edgeslam_torch.estimation.telemetry.track import TelemetryTrack, is_range
 from edgeslam_torch.noise import DELAY_S, HEIGHT_M, HEIGHT_MEMORY_S, TILT_RAD
 from edgeslam_torch.types import FloatArray, IntArray, TelemetrySample
 
@@ -38,6 +38,8 @@ def climb(before: TelemetrySample | None, sample: TelemetrySample, step_m_s: flo
         step_m_s: Resolution of the reported velocity.
     """
     if before is None or not 0.0 < sample.stamp_s - before.stamp_s < _PAUSE_S:
+        return math.nan
+    if not (is_range(before.tof_m, before.rpy_rad) and is_range(sample.tof_m, sample.rpy_rad)):
         return math.nan
     pause_s = sample.stamp_s - before.stamp_s
     found = (sample.tof_m - before.tof_m) / pause_s

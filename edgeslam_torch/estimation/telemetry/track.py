@@ -349,14 +349,22 @@ class TelemetryTrack:
         return self.readings.heights if len(self) else {}
 
 
+def is_range(tof_m: FloatArray | float, rpy_rad: FloatArray) -> NDArray[np.bool_]:
+    """Whether readings ``(...)`` of the range sensor, at roll, pitch and yaw ``(..., 3)``, are heights.
+
+    The SDK says 10 cm on the ground and 65.53 m out of range; a leaning drone measures along a slanted ray.
+    """
+    lean = np.cos(rpy_rad[..., 0]) * np.cos(rpy_rad[..., 1])
+    tof_m = np.asarray(tof_m)
+    return np.asarray((tof_m > 0.15) & (tof_m < 8.0) & np.logical_not(lean < _UPRIGHT))
+
+
 def _heights(reported: Readings) -> dict[str, tuple[FloatArray, FloatArray]]:
-    lean = np.cos(reported.rpy[:, 0]) * np.cos(reported.rpy[:, 1])
     sources = {}
     for name, z in (("tof", reported.tof), ("h", reported.height), ("baro", reported.baro)):
         good = np.isfinite(z) & ~reported.frozen
         if name == "tof":
-            # SDK sentinels: 10 cm on the ground, 65.53 m out of range. A leaning drone measures along a slanted ray.
-            good &= (z > 0.15) & (z < 8.0) & np.logical_not(lean < _UPRIGHT)
+            good &= is_range(z, reported.rpy)
         if good.any():
             sources[name] = (reported.stamp_s[good], z[good])
     return sources
