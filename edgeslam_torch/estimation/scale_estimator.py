@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from edgeslam_torch.estimation.config import FusionConfig
-from edgeslam_torch.estimation.scale.belief import Decision, ScaleBelief, average, contradict, decide, widened
+from edgeslam_torch.estimation.scale.belief import Decision, ScaleBelief, contradict, decide, mean
 from edgeslam_torch.estimation.scale.depth_scale import DepthRatio, DepthRatios
 from edgeslam_torch.estimation.telemetry.sensor_validation import HEIGHTS, SensorGate
 from edgeslam_torch.estimation.telemetry_scale import TelemetryFit
@@ -100,26 +100,18 @@ class ScaleEstimator:
         if tuple(beliefs) != self._beliefs:
             self._beliefs = tuple(beliefs)
             self._decided = decide(beliefs, only_witness=depth is not None and not depth.in_domain)
-            self._scale = self._averaged()
+            others = [b for b in self._decided.used if b.source not in _TELEMETRY]
+            sensors = self.sensor_scale
+            inside = 0 if sensors is None else sensors.source.count("+")
+            used = mean(([] if sensors is None else [sensors]) + others, inside)
+            self._scale = ScaleEstimate() if used is None else used.estimate
         return self._decided
-
-    def _averaged(self) -> ScaleEstimate:
-        """The mean of the estimates that are used; velocities and heights have the map's noise in common."""
-        used = self._decided.used
-        others = [b for b in used if b.source not in _TELEMETRY]
-        sensors = [] if self.sensor_scale is None else [b for b in used if b.source in _TELEMETRY]
-        if not sensors + others:
-            return ScaleEstimate()
-        single = [self._by_telemetry[b.source] for b in sensors]
-        means = ([self._with_common(average(single))] if single else []) + others
-        return widened(average(means), sensors + others).estimate
 
     @property
     def sensor_scale(self) -> ScaleBelief | None:
         """Scale by the drone's velocities and heights, if they are accurate enough."""
         used = {b.source for b in self.decided.used}
-        sensors = [belief for name, belief in self._by_telemetry.items() if name in used]
-        measured = widened(average(sensors), sensors) if sensors else None
+        measured = mean([belief for name, belief in self._by_telemetry.items() if name in used])
         if measured is None or math.hypot(measured.sigma, self.fit.noise_log) >= _BELIEVED:
             return None
         return self._with_common(measured)

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from edgeslam_torch.estimation.scale.belief import ScaleBelief, average, contradict, decide, widened
+from edgeslam_torch.estimation.scale.belief import ScaleBelief, contradict, decide, mean
 from edgeslam_torch.types import Units
 
 
@@ -55,7 +55,7 @@ def test_limits_are_sigmas_of_the_difference():
 
 
 def test_the_average_is_weighted_with_all_sources_named():
-    fused = average(
+    fused = mean(
         [ScaleBelief(0.0, 0.01, "telemetry"), ScaleBelief(0.02, 0.02, "height"), ScaleBelief(0, 0.09, "depth")]
     )
     assert fused.log_scale == pytest.approx(0.004, abs=0.001)
@@ -65,7 +65,7 @@ def test_the_average_is_weighted_with_all_sources_named():
 
 
 def test_a_third_estimate_widens_two_that_agree_less_than_one():
-    sensors, network = [ScaleBelief(0.0, 0.06, "telemetry"), ScaleBelief(0.0, 0.06, "height")], by(1.35, 0.12, "depth")
-    found = average([*sensors, network])
-    assert widened(found, [average(sensors), network]).sigma == pytest.approx(0.04 * 2.357, rel=0.01)
-    assert widened(found, [*sensors, network]).sigma == pytest.approx(0.04 * 1.667, rel=0.01)
+    sensors = mean([ScaleBelief(0.0, 0.06, "telemetry"), ScaleBelief(0.0, 0.06, "height")])
+    network = ScaleBelief(0.3, 0.12, "depth")  # 2.357 sigmas off
+    assert mean([sensors, network]).sigma == pytest.approx(0.04 * 2.357, rel=0.01)
+    assert mean([sensors, network], inside=1).sigma == pytest.approx(0.04 * math.sqrt((1 + 2.357**2) / 2), rel=0.01)

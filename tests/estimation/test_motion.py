@@ -188,6 +188,16 @@ def test_a_scale_is_held_in_hover_unless_it_is_from_heights_alone(sources, held,
     assert (metres.sensor_scale is not None) == (held and found is None)
 
 
+@pytest.mark.parametrize("common", [0.0, 0.1])
+def test_noise_in_common_does_not_explain_that_velocities_and_heights_disagree(common):
+    """By two sigmas of their difference: their mean has half of it as its sigma, beside what they share."""
+    metres, own, off = ScaleEstimator(FusionConfig(), 0.0), 0.03, 0.06 * math.sqrt(2.0)
+    trusting = SimpleNamespace(velocity=True, tells_scale=True, height=lambda reading: True)
+    told = {"telemetry": ScaleBelief(0.0, own, "telemetry"), "height": ScaleBelief(off, own, "height")}
+    metres.take(told, TelemetryFit(noise_log=common), trusting)
+    assert metres.scale().sigma / metres.scale().value == pytest.approx(math.hypot(off / 2.0, common), rel=0.01)
+
+
 @pytest.mark.parametrize(
     ("source", "sigma", "path_ratio", "used"),
     [

@@ -14,7 +14,7 @@ neither is used.
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -112,23 +112,26 @@ def _gap(a: ScaleBelief, b: ScaleBelief) -> float:
     return abs(a.log_scale - b.log_scale)
 
 
-def average(beliefs: Sequence[ScaleBelief]) -> ScaleBelief:
-    """Information-weighted mean of independent estimates, at least one."""
+def mean(beliefs: Sequence[ScaleBelief], inside: int = 0) -> ScaleBelief | None:
+    """Information-weighted mean of independent estimates; sigma grows with their disagreement.
+
+    Args:
+        beliefs: The estimates.
+        inside: Degrees of freedom inside them, if some are means of several: their scatter is in their sigmas already,
+            and two sensors that agree say more of a third estimate than one.
+    """
+    if not beliefs:
+        return None
     log_scale = np.array([b.log_scale for b in beliefs])
     weight = np.array([b.sigma for b in beliefs]) ** -2.0
     centre = float(np.sum(weight * log_scale) / np.sum(weight))
-    return ScaleBelief(centre, float(np.sum(weight)) ** -0.5, "+".join(dict.fromkeys(b.source for b in beliefs)))
-
-
-def widened(mean: ScaleBelief, beliefs: Sequence[ScaleBelief]) -> ScaleBelief:
-    """The mean of estimates with a sigma that covers their disagreement."""
-    sigma = mean.sigma
+    sigma = float(np.sum(weight)) ** -0.5
     if len(beliefs) > 1:  # Birge ratio: estimates that disagree beyond their sigmas widen the result
-        scatter = sum(((b.log_scale - mean.log_scale) / b.sigma) ** 2 for b in beliefs)
-        sigma *= max(1.0, math.sqrt(scatter / (len(beliefs) - 1)))
+        scatter = float(np.sum(weight * (log_scale - centre) ** 2)) + inside
+        sigma *= max(1.0, math.sqrt(scatter / (len(beliefs) - 1 + inside)))
     if any(contradict(a, b) for a, b in itertools.combinations(beliefs, 2)):  # it may be that of either
-        sigma = max(sigma, float(np.ptp([b.log_scale for b in beliefs])))
-    return replace(mean, sigma=sigma)
+        sigma = max(sigma, float(np.ptp(log_scale)))
+    return ScaleBelief(centre, sigma, "+".join(dict.fromkeys(b.source for b in beliefs)))
 
 
 def disagreement(sources: Sequence[ScaleEstimate]) -> float:
