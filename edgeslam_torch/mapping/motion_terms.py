@@ -22,9 +22,8 @@ EFFECTIVE_SAMPLES_AT_THE_END = 1.0
 """The same in the last refinement: drift was corrected in flight, and telemetry errors, correlated over seconds, would
 deform the map."""
 GUESSED = 300.0
-"""The same for gravity in a new map without metric scale: predicted depths, whose errors are correlated over the whole
-image, distinguish rotation from translation. Ten times as much held maps to a wrong pitch before it was recognised; a
-tenth lets a climb before bare walls lean."""
+"""The same for gravity before the metric scale is known: predicted depths, whose errors are correlated over the whole
+image, distinguish rotation from translation (docs/decisions/05-first-frame.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +33,18 @@ class MotionFactors:
     centres: tuple[CentreFactor, ...] = ()
     gravity: tuple[GravityFactor, ...] = ()
     headings: tuple[HeadingFactor, ...] = ()
+
+
+def gravity_since(model: TelemetryModel | None, reference: Keyframe, stamp_s: float) -> GravityFactor | None:
+    """The vertical in one frame, pose 0, by one attitude of the drone, in a world in which a keyframe's is right; None
+    without attitude."""
+    if model is None or len(model.track) == 0 or model.track.readings.stamp_s[0] > reference.stamp_s:
+        return None
+    # The picture is older than it arrives: the first ones are older than the first message.
+    up = model.up(np.maximum([reference.stamp_s, stamp_s], model.track.readings.stamp_s[0] + model.delay_s))
+    if up is None or len(up.frame) < 2:
+        return None
+    return GravityFactor(np.zeros(1, dtype=np.int64), up.up_c[1:], reference.T_w_c[:3, :3] @ up.up_c[0], up.sigma_rad)
 
 
 def motion_factors(
@@ -77,8 +88,8 @@ def motion_factors(
             centres.append(CentreFactor(order, effective_samples * inert, np.zeros(len(inert)), 0.0))
         up, attitude = model.up(stamps), max(1.0, ATTITUDE * effective_samples)
         if up is not None:
-            share = GUESSED if model.holds_level else attitude
-            sigma_rad = max(up.sigma_rad / math.sqrt(share), ATTITUDE_RAD)
+            known = max(up.sigma_rad / math.sqrt(attitude), ATTITUDE_RAD)
+            sigma_rad = up.sigma_rad / math.sqrt(GUESSED) if model.holds_level else known
             gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, sigma_rad))
         heading = model.headings(stamps)
         if heading is not None and heading.passes(np.stack([keyframes[i].T_c_w[:3, :3] for i in order[heading.frame]])):

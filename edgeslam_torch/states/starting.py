@@ -151,7 +151,7 @@ class Starting:
         self.system.motion.move(frame.stamp_s, track.T_c_w)
         leaving = track.inliers < ADOPT_SHARE * attempt.max_matched and attempt.reference.depth is not None
         with self.system.timed("initialisation"):
-            two_view = attempt.two_views(frame, view, track, leaving)
+            two_view = attempt.two_views(frame, view, track, leaving, self.system.gravity(frame.stamp_s))
         if two_view.structure is None and leaving:
             with self.system.timed("mapping"), self.system.map.lock:
                 started = attempt.adopt(frame, view, track)
@@ -185,7 +185,7 @@ class Starting:
     def _track(self, attempt: Bootstrap, frame: Frame, view: View) -> Track | None:
         system = self.system
         T_predicted = system.predict(frame.stamp_s, lost=False)
-        track = attempt.track(view, T_predicted, system.pose_prior(frame.stamp_s, T_predicted))
+        track = attempt.track(view, T_predicted, system.expected_pose(frame.stamp_s, T_predicted))
         if track is None or track.inliers < system.config.tracking.min_inliers:  # a fast rotation: search everywhere
             newest = candidates(system.tracker, T_predicted, 1, 0)
             track = next(filter(None, (match_keyframe(system.tracker, view, k) for k in newest)), None)

@@ -105,11 +105,12 @@ class Tracking:
             located = matched
         return self._by_edges(frame, seen, T_predicted) if located is None else located
 
-    def _check_with_sensors(self, frame: Frame, seen: LazyView, located: Located) -> Located:
+    def _check_with_sensors(self, frame: Frame, seen: LazyView, located: Located) -> Located | None:
         """Repeat the search from the sensors' prediction if the drone's sensors contradict a pose.
 
         On a repetitive pattern, such as wallpaper, matching may lock on the neighbouring repetition. If the second
-        search gives the same pose it is kept: telemetry alone moves no pose.
+        search gives the same pose it is kept, since telemetry alone moves no pose; None if it is a jump that the motion
+        in the images so far contradicts, too.
         """
         predicted, template = self._predicted_by_sensors(frame.stamp_s), self._template
         if predicted is None or predicted[1].allows_pose(predicted[0], located.track.T_c_w):
@@ -118,6 +119,9 @@ class Tracking:
         if again is None or not predicted[1].allows_pose(predicted[0], again.track.T_c_w):
             self._template = template
             self.system.events["contradicted"] += 1
+            motion = self.system.motion
+            if not motion.velocity_unknown and predicted[1].allows_pose(predicted[0], motion.predict(frame.stamp_s)):
+                return None
             return replace(located, contradicted=True)
         return again
 
@@ -175,7 +179,8 @@ class Tracking:
         """Optical flow from the last keyframe."""
         if self._template is None or not self.system.config.flow.enabled:
             return None
-        return self._flow.follow(self._template, seen.grey, T_predicted, self.system.pose_prior(stamp_s, T_predicted))
+        expected = self.system.expected_pose(stamp_s, T_predicted)
+        return self._flow.follow(self._template, seen.grey, T_predicted, expected)
 
     def _locate_followed(self, followed: Followed, stamp_s: float) -> Located:
         reference = self.system.map.keyframes.get(followed.keyframe_id, self.system.map.latest())
@@ -235,7 +240,7 @@ class Tracking:
         self, frame: Frame, view: View, T_predicted: FloatArray, followed: Followed | None, strong: bool
     ) -> tuple[Track | None, bool]:
         """Track near flow's result or the prediction, else relocalise; and whether it was relocalised."""
-        tracker, expected = self.system.tracker, self.system.pose_prior(frame.stamp_s, T_predicted)
+        tracker, expected = self.system.tracker, self.system.expected_pose(frame.stamp_s, T_predicted)
         if followed is not None and strong:
             track = tracker.track_near(view, followed.track.T_c_w, followed.track.anchor, expected)
             return None if track is None else join(track, followed, view, self.system.config.orb.scale_factor), False
@@ -287,7 +292,7 @@ class Tracking:
     def _by_edges(self, frame: Frame, seen: LazyView, T_predicted: FloatArray) -> Located | None:
         """The pose from edges alone."""
         with self.system.timed("edges"):
-            expected = self.system.pose_prior(frame.stamp_s, T_predicted)
+            expected = self.system.expected_pose(frame.stamp_s, T_predicted).prior(True)
             alone = self._edge_tracker.refine(seen.grey, T_predicted, None, expected)
         if alone is None or not alone.is_fixed or self._contradicts_sensors(alone.T_c_w, frame.stamp_s):
             return None
@@ -306,7 +311,7 @@ class Tracking:
             np.zeros((len(anchor), 2)) if slack is None else slack,
         )
         with system.timed("edges"):
-            expected = system.pose_prior(frame.stamp_s, T_predicted)
+            expected = system.expected_pose(frame.stamp_s, T_predicted).prior(True)
             both = self._edge_tracker.refine(seen.grey, located.track.T_c_w, points, expected)
         if both is None or both.edges < MIN_EDGES or both.points.mean() < 0.5:
             return located

@@ -18,8 +18,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.optim.problem import PosePrior
-from edgeslam_torch.tracking.pose_prior import pose_on_anchors
+from edgeslam_torch.tracking.pose_prior import ExpectedPose, pose_on_anchors
 from edgeslam_torch.tracking.tracker import FINE, Track, View
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
@@ -176,7 +175,7 @@ class FlowTracker:
         self._chosen = _Chosen(None, -1, np.zeros(0, dtype=np.int64))
 
     def follow(
-        self, template: Template, grey: NDArray[np.uint8], T_c_w: FloatArray, expected: PosePrior | None = None
+        self, template: Template, grey: NDArray[np.uint8], T_c_w: FloatArray, expected: ExpectedPose | None = None
     ) -> Followed | None:
         """Pose near a predicted one, or None if hardly any keypoint is tracked.
 
@@ -184,7 +183,7 @@ class FlowTracker:
             template: Template to track.
             grey: Frame ``(H, W)`` with the lens distortion still in it.
             T_c_w: Predicted pose ``(4, 4)``.
-            expected: Prior of the pose, used while depths are uncertain.
+            expected: The pose as predicted.
         """
         wanted = self._wanted(template)
         guess = self._expected(T_c_w, template.anchor[wanted])
@@ -215,7 +214,7 @@ class FlowTracker:
         guess: FloatArray,
         T_c_w: FloatArray,
         levels: int,
-        expected: PosePrior | None,
+        expected: ExpectedPose | None,
     ) -> tuple[Track, FloatArray]:
         """Pose from flow over the given pyramid levels, and the inliers' undistorted pixels."""
         raw_uv, found = self._flow(template, grey, keypoint, guess, levels)
@@ -264,7 +263,7 @@ class FlowTracker:
         return np.asarray(uv, dtype=np.float32).reshape(-1, 2), found
 
     def _solve(
-        self, template: Template, keypoint: IntArray, uv: FloatArray, T_c_w: FloatArray, expected: PosePrior | None
+        self, template: Template, keypoint: IntArray, uv: FloatArray, T_c_w: FloatArray, expected: ExpectedPose | None
     ) -> Track:
         # Flow inherits the localisation error of the keyframe's keypoint: same weight as a match.
         anchor = template.anchor[keypoint]

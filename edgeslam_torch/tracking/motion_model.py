@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray
 
 ACCELERATION_M_S2 = 3.0
@@ -44,13 +43,14 @@ class MotionModel:
         # Each pose is a product with the previous one: projected to SE(3), rounding errors do not accumulate.
         return se3.orthonormalised(se3.exp(self._velocity * (stamp_s - self.stamp_s)) @ self.T_c_w)
 
-    def pose_prior(self, stamp_s: float, T_predicted: FloatArray, metres_per_unit: float) -> PosePrior:
-        """A predicted pose with its uncertainty due to accelerations since the newest frame."""
+    def information(self, stamp_s: float, metres_per_unit: float) -> FloatArray:
+        """Information ``(6, 6)`` of a predicted pose, left perturbation: limited by accelerations since the newest
+        frame."""
         dt = stamp_s - self.stamp_s
         speed, turn = (SPEED_M_S, ANGULAR_SPEED_RAD_S) if self.velocity_unknown else (0.0, 0.0)  # motion is possible
         sigma_t = math.hypot(speed * dt, 0.5 * ACCELERATION_M_S2 * dt**2) / metres_per_unit
         sigma_r = math.hypot(turn * dt, 0.5 * ANGULAR_ACCELERATION_RAD_S2 * dt**2)
-        return PosePrior(0, T_predicted, np.diag([sigma_t**-2] * 3 + [sigma_r**-2] * 3))
+        return np.diag([sigma_t**-2] * 3 + [sigma_r**-2] * 3)
 
     def move(self, stamp_s: float, T_c_w: FloatArray) -> None:
         """Accept a measured pose and update the velocity."""

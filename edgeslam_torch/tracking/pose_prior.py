@@ -1,11 +1,56 @@
-"""A frame's pose from anchors, with the motion model's prediction where these rest on predicted depths."""
+"""A frame's pose from anchors, with what motion model and attitude predict."""
+
+from dataclasses import dataclass
+
+import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.rotations import smallest_rotation
 from edgeslam_torch.map.anchors import Anchors
+from edgeslam_torch.mapping.motion_terms import ATTITUDE, EFFECTIVE_SAMPLES, GUESSED
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
 from edgeslam_torch.optim.pose_only import PoseConfig, PoseResult, refine_pose
-from edgeslam_torch.optim.problem import PosePrior
+from edgeslam_torch.optim.problem import GravityFactor, PosePrior
 from edgeslam_torch.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedPose:
+    """A frame's pose before its image is measured."""
+
+    T_c_w: FloatArray
+    """``(4, 4)``; the vertical is where the drone's attitude has it, if that is known."""
+    motion: FloatArray
+    """``(6, 6)`` information of a left perturbation, limited by accelerations; zero without a scale."""
+    level: FloatArray
+    """``(6, 6)`` the same of the vertical by one attitude; zero without any."""
+
+    def prior(self, on_predicted_depths: bool) -> PosePrior:
+        """The prior with the weight of attitude in windows, see `mapping.motion_terms`.
+
+        Images of few and distant points, or of one plane, hardly distinguish a climb from a pitch, so that attitude
+        counts in every frame. On predicted depths, whose errors are common to the whole image, the motion counts, too.
+        """
+        if on_predicted_depths:
+            return PosePrior(0, self.T_c_w, self.motion + GUESSED * self.level)
+        return PosePrior(0, self.T_c_w, ATTITUDE * EFFECTIVE_SAMPLES * self.level)
+
+
+def expected_pose(T_c_w: FloatArray, motion: FloatArray, gravity: GravityFactor | None) -> ExpectedPose:
+    """A predicted pose ``(4, 4)``, turned about its centre so that the vertical is where it was measured.
+
+    Args:
+        T_c_w: The prediction.
+        motion: Its information ``(6, 6)``.
+        gravity: The vertical in the frame by one attitude.
+    """
+    level = np.zeros((6, 6))
+    if gravity is None:
+        return ExpectedPose(T_c_w, motion, level)
+    T, up_c = T_c_w.copy(), gravity.up_c[0]
+    T[:3] = smallest_rotation(T_c_w[:3, :3] @ gravity.up_w, up_c) @ T_c_w[:3]
+    level[3:, 3:] = (np.eye(3) - np.outer(up_c, up_c)) / gravity.sigma_rad**2
+    return ExpectedPose(T, motion, level)
 
 
 def pose_on_anchors(
@@ -15,7 +60,7 @@ def pose_on_anchors(
     inv_sigma: FloatArray,
     T_c_w: FloatArray,
     camera: Camera,
-    expected: PosePrior | None,
+    expected: ExpectedPose | None,
     config: PoseConfig,
 ) -> PoseResult:
     """Robust pose of a frame from anchors ``(N,)`` at pixels ``(N, 2)``.
@@ -27,12 +72,11 @@ def pose_on_anchors(
         inv_sigma: ``(N,)`` inverse standard deviations [1/px].
         T_c_w: Initial pose ``(4, 4)``.
         camera: Intrinsics.
-        expected: The predicted pose, used where most anchors rest on predicted depths: their errors are common to the
-            whole image, and a translation may look like a rotation.
+        expected: The predicted pose; the images alone decide without one.
         config: Solver settings.
     """
     slack_px = depth_slack_px(anchors, anchor, T_c_w, camera)
-    prior = expected if mostly_on_priors(anchors, anchor) else None
+    prior = None if expected is None else expected.prior(mostly_on_priors(anchors, anchor))
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     return refine_pose(
         T_c_w, anchors.p_w[anchor], uv, inv_sigma, intrinsics, slack_px=slack_px, prior=prior, config=config

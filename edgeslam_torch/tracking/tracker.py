@@ -14,8 +14,7 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.projection import Projection, match_projection, project_anchors
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.optim.pose_only import PoseConfig
-from edgeslam_torch.optim.problem import PosePrior
-from edgeslam_torch.tracking.pose_prior import pose_on_anchors
+from edgeslam_torch.tracking.pose_prior import ExpectedPose, pose_on_anchors
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
 ROUGH = PoseConfig(rounds=1, robust_rounds=1, iterations=5, cost_tolerance=1e-2)
@@ -97,7 +96,9 @@ class Tracker:
         self.orb = orb
         self.config = config
 
-    def track(self, view: View, T_c_w: FloatArray, recent: IntArray, expected: PosePrior | None = None) -> Track | None:
+    def track(
+        self, view: View, T_c_w: FloatArray, recent: IntArray, expected: ExpectedPose | None = None
+    ) -> Track | None:
         """Pose near a predicted one: anchors of the last frame first, then the local map; None with too few
         inliers."""
         some = recent[:: 1 + len(recent) // ENOUGH_FOR_ROUGH]
@@ -109,7 +110,7 @@ class Tracker:
         return self._complete(view, first.T_c_w, first.anchor, first.keypoint, first.anchor, expected)
 
     def track_near(
-        self, view: View, T_c_w: FloatArray, recent: IntArray, expected: PosePrior | None = None
+        self, view: View, T_c_w: FloatArray, recent: IntArray, expected: ExpectedPose | None = None
     ) -> Track | None:
         """The same from a pose accurate to a pixel or two, without the first pass."""
         return self._complete(view, T_c_w, recent, recent[:0], recent[:0], expected)
@@ -127,7 +128,7 @@ class Tracker:
         anchor_ids: IntArray,
         radius_px: float,
         effort: PoseConfig = FINE,
-        expected: PosePrior | None = None,
+        expected: ExpectedPose | None = None,
     ) -> Track | None:
         """Match the given anchors around their predicted pixels and refine the pose on the matches."""
         seen = self.expected(T_c_w, anchor_ids)
@@ -141,7 +142,7 @@ class Tracker:
         recent: IntArray,
         keypoint: IntArray,
         anchor: IntArray,
-        expected: PosePrior | None,
+        expected: ExpectedPose | None,
     ) -> Track | None:
         """Track against the local map around ``recent``; known matches are kept."""
         anchors = self.map.anchors
@@ -182,7 +183,7 @@ class Tracker:
         keypoint: IntArray,
         anchor: IntArray,
         effort: PoseConfig = FINE,
-        expected: PosePrior | None = None,
+        expected: ExpectedPose | None = None,
     ) -> Track | None:
         """Robust pose from given matches; None with too few of them."""
         if len(keypoint) < 6:

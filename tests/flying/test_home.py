@@ -43,25 +43,39 @@ def output(scale, sigma=0.02, metric=True):
 
 
 @pytest.mark.parametrize(
-    ("known", "newest", "may_move", "metres"),
+    ("known", "newest", "late", "metres"),
     [
         (math.nan, output(0.6), True, 0.6),
         (0.6, output(0.62), True, 0.62),
         (0.6, output(0.58), True, 0.58),
         (0.6, output(0.603), True, 0.6),
         (0.6, output(0.62), False, 0.6),
+        (0.6, output(0.3), False, 0.3),
+        (math.nan, output(0.6), False, 0.6),
         (0.6, output(0.62, metric=False), True, 0.6),
         (0.6, output(1.0, sigma=math.inf), True, 0.6),
         (0.6, output(0.53, sigma=0.11), True, 0.6),
         (0.6, output(0.4, sigma=0.05), True, 0.4),
         (math.nan, output(0.53, sigma=0.11), True, 0.53),
     ],
-    ids=["first", "grew", "shrank", "hardly", "not now", "no metres", "no estimate", "unsure", "no room", "rough"],
+    ids=[
+        "first",
+        "grew",
+        "shrank",
+        "hardly",
+        "soon",
+        "wrong",
+        "first soon",
+        "no metres",
+        "no sigma",
+        "unsure",
+        "no room",
+        "rough",
+    ],
 )
-def test_it_goes_by_the_best_estimate_where_that_is_worth_a_move(known, newest, may_move, metres):
-    assert metres_per_unit(known, newest, may_move) == metres
+def test_it_goes_by_the_best_estimate_where_that_is_worth_a_move(known, newest, late, metres):
+    assert metres_per_unit(known, newest, late) == metres
 
 
-def test_without_metres_and_without_a_view_to_move_nothing_is_known():
-    assert math.isnan(metres_per_unit(math.nan, output(0.6), may_move=False))
-    assert math.isnan(metres_per_unit(math.nan, output(0.6, metric=False), may_move=True))
+def test_without_metres_nothing_is_known():
+    assert math.isnan(metres_per_unit(math.nan, output(0.6, metric=False), late=True))

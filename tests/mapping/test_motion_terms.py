@@ -20,7 +20,7 @@ from edgeslam_torch.map.keyframe import NO_ANCHOR
 from edgeslam_torch.map.revisit import MIN_SHARED, is_back
 from edgeslam_torch.mapping.last_refinement import lm_config
 from edgeslam_torch.mapping.mapper import Mapper
-from edgeslam_torch.mapping.motion_terms import EFFECTIVE_SAMPLES, motion_factors
+from edgeslam_torch.mapping.motion_terms import EFFECTIVE_SAMPLES, gravity_since, motion_factors
 from edgeslam_torch.mapping.refinement import (
     Window,
     recent_map,
@@ -284,6 +284,25 @@ def test_gravity_dominates_in_a_new_map_without_metric_scale(rng, halves):
         for m in (replace(model, scale_sigma_log=np.inf, velocity=False, new_map=True), model)
     )
     assert np.degrees(before.sigma_rad) < 0.4 < 0.5 < np.degrees(after.sigma_rad)
+
+
+@pytest.mark.parametrize("early_s", [0.0, 1.3])
+def test_the_vertical_since_a_keyframe_is_in_the_world_of_its_pose(rng, halves, early_s):
+    """However that leans, and although its picture may be older than the first message."""
+    model = replace(telemetry_of(rng, halves), delay_s=0.5)
+    reference, newest = halves.keyframes[0], halves.keyframes[-1]
+    reference.stamp_s += model.delay_s - early_s
+    true = halves.world.T_c_w[5] @ se3.inverse(halves.world.T_c_w[0])
+    reference.T_c_w = reference.T_c_w @ se3.exp(np.array([0.5, 0.0, 1.0, 0.3, -0.2, 0.1]))
+    found = gravity_since(model, reference, newest.stamp_s + model.delay_s)
+    np.testing.assert_allclose(found.up_c[0], true[:3, :3] @ reference.T_c_w[:3, :3] @ found.up_w, atol=1e-3)
+
+
+def test_the_vertical_since_a_keyframe_needs_a_message_before_it(rng, halves):
+    reference, at_s = halves.keyframes[0], halves.keyframes[-1].stamp_s
+    reference.stamp_s = -2.0
+    assert gravity_since(telemetry_of(rng, halves), reference, at_s) is None
+    assert gravity_since(None, reference, at_s) is None
 
 
 def test_a_whole_map_may_use_the_full_weight_of_telemetry(rng, halves):

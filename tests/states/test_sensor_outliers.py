@@ -1,6 +1,8 @@
 """Poses that the filter's prediction contradicts: on a repetitive wall, corners match the neighbouring
 repetition. (Corners on whole pixels; with sub-pixel alignment such mismatches are rare.)"""
 
+from dataclasses import replace
+
 import numpy as np
 from rendered import CAMERA, film, panels, patchwork
 
@@ -9,6 +11,7 @@ from edgeslam_torch.estimation.filter.filter_feed import PoseEstimate
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
+from edgeslam_torch.types import FrameStatus
 
 PERIOD_M = 0.24
 """31 px of a wall 2 m away."""
@@ -17,6 +20,7 @@ STEP_RAD = 0.09
 the prediction."""
 
 
+PREDICTED, TRACKED, RELOCALISED = FrameStatus.PREDICTED, FrameStatus.TRACKED, FrameStatus.RELOCALISED
 STEPS = 11, 15
 """Frames around the larger steps."""
 
@@ -81,3 +85,17 @@ def test_wrong_sensors_do_not_change_a_pose_that_images_confirm():
     for a, b in zip(lied, alone, strict=True):
         np.testing.assert_allclose(a.T_w_c, b.T_w_c, atol=2e-3)
     assert "contradicted" in lied[-1].reason
+
+
+def test_a_jump_that_neither_sensors_nor_the_motion_so_far_explain_is_no_pose():
+    """A decoder shows an old picture once. Sensors that jump with it vouch for it."""
+    flight = panels().first(16)
+    flight.frames[13] = replace(flight.frames[13], image=flight.frames[5].image)
+    held, alone = flown(flight, true_motion(flight)), flown(flight)
+    jumped = replace(flight, T_w_c=np.array([*flight.T_w_c[:13], flight.T_w_c[5], *flight.T_w_c[14:]]))
+    vouched = flown(flight, true_motion(jumped))
+    assert [out[13].status for out in (held, alone, vouched)] == [PREDICTED, TRACKED, TRACKED]
+    assert held[14].status in (TRACKED, RELOCALISED)
+    steps = [out[13].T_w_c[:3, 3] - out[12].T_w_c[:3, 3] for out in (held, alone, vouched)]
+    held_m, *jumped_m = np.linalg.norm(steps, axis=1)
+    assert held_m < 0.05 < 0.15 < min(jumped_m)

@@ -49,9 +49,9 @@ def test_a_correction_of_the_keyframe_moves_the_pose_in_the_keyframes_frame():
 
 def test_sigma_of_a_prediction_grows_with_the_square_of_time_in_map_units():
     model = moving()
-    near, far = (model.pose_prior(10.5 + dt, at(1.5), 2.0).information for dt in (0.1, 0.2))
+    near, far = (model.information(10.5 + dt, 2.0) for dt in (0.1, 0.2))
     assert np.allclose(np.sqrt(np.diag(near) / np.diag(far)), 4.0)
-    metres = model.pose_prior(10.6, at(1.5), 1.0).information
+    metres = model.information(10.6, 1.0)
     assert np.allclose(np.sqrt(np.diag(near)[:3] / np.diag(metres)[:3]), 2.0)  # a unit is two metres
     assert np.allclose(np.diag(near)[3:], np.diag(metres)[3:])
 
@@ -74,5 +74,5 @@ def test_unknown_velocity_increases_the_sigma():
     """Half a metre and one radian a second over a tenth, beside what accelerations add."""
     model = MotionModel(at(1.0))
     model.stamp_s = 10.0
-    sigma = 1.0 / np.sqrt(np.diag(model.pose_prior(10.1, at(1.0), 1.0).information))
+    sigma = 1.0 / np.sqrt(np.diag(model.information(10.1, 1.0)))
     assert np.allclose(sigma, [np.hypot(0.05, 0.015)] * 3 + [np.hypot(0.1, 0.1)] * 3)

@@ -9,8 +9,8 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.anchors import Anchors
 from edgeslam_torch.optim.pose_only import PoseConfig
-from edgeslam_torch.optim.problem import PosePrior
-from edgeslam_torch.tracking.pose_prior import pose_on_anchors
+from edgeslam_torch.optim.problem import GravityFactor
+from edgeslam_torch.tracking.pose_prior import ExpectedPose, expected_pose, pose_on_anchors
 
 CAMERA = Camera(640, 480, 460.0, 460.0, 320.0, 240.0)
 LEVEL = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -39,8 +39,8 @@ def wall(rng):
 
 def solved(wall, sigma_rad):
     anchors, ids, uv = wall
-    level = PosePrior(0, LEVEL, np.diag([1.0] * 3 + [sigma_rad**-2] * 3))
-    return pose_on_anchors(anchors, ids, uv, np.ones(len(ids)), LEVEL, CAMERA, level, PoseConfig())
+    expected = ExpectedPose(LEVEL, np.diag([1.0] * 3 + [sigma_rad**-2] * 3), np.zeros((6, 6)))
+    return pose_on_anchors(anchors, ids, uv, np.ones(len(ids)), LEVEL, CAMERA, expected, PoseConfig())
 
 
 def tilt_deg(T_c_w):
@@ -54,7 +54,68 @@ def test_a_prior_resolves_a_climb_on_predicted_depths(wall):
     assert tilt_deg(loose) > 0.1
 
 
-def test_triangulated_anchors_need_no_prior(wall):
+def test_on_triangulated_anchors_no_motion_is_expected(wall):
     anchors, ids, uv = wall
     anchors.from_depth[ids] = False
     np.testing.assert_array_equal(*(solved(wall, sigma_rad).T_c_w for sigma_rad in (1e-4, 10.0)))
+
+
+def leaning(rng, angle_rad):
+    """A pose ``T_c_w`` that leans about a random horizontal axis, and what an upright camera there sees as up."""
+    axis = rng.uniform(0.0, 2.0 * math.pi)
+    upright = LEVEL @ se3.exp(np.array([1.0, -2.0, 0.5, 0.0, 0.0, rng.uniform(-3.0, 3.0)]))
+    lean = upright[:3, :3] @ [math.cos(axis), math.sin(axis), 0.0]
+    leans = se3.exp(np.concatenate([np.zeros(3), angle_rad * lean])) @ upright
+    up_w = np.array([0.0, 0.0, 1.0])
+    return leans, upright, GravityFactor(np.zeros(1, np.int64), upright[:3, 2][None], up_w, math.radians(0.2))
+
+
+def test_a_levelled_prediction_keeps_its_centre_and_its_heading(rng):
+    leans, upright, gravity = leaning(rng, 0.3)
+    np.testing.assert_allclose(expected_pose(leans, np.zeros((6, 6)), gravity).T_c_w, upright, atol=1e-9)
+
+
+def test_of_a_levelled_prediction_the_vertical_is_known(rng):
+    leans, _, gravity = leaning(rng, 0.3)
+    up_c, motion = gravity.up_c[0], np.diag([4.0] * 3 + [9.0] * 3)
+    expected = expected_pose(leans, motion, gravity)
+    assert np.count_nonzero(expected.level[:3]) == np.count_nonzero(expected.level[:, :3]) == 0
+    np.testing.assert_allclose(expected.level[3:, 3:] @ up_c, 0.0, atol=1e-6)
+    across = np.cross(up_c, [0.3, -0.5, 0.8])
+    np.testing.assert_allclose(expected.level[3:, 3:] @ across, across / gravity.sigma_rad**2, rtol=1e-9)
+    on_depths, triangulated = (expected.prior(rests).information for rests in (True, False))
+    assert on_depths[3:, 3:] @ across @ across > 5.0 * (triangulated[3:, 3:] @ across @ across) > 0.0
+    np.testing.assert_allclose(on_depths[:3], motion[:3])
+    assert np.count_nonzero(triangulated[:3]) == 0
+
+
+def test_without_attitude_a_prediction_stays(rng):
+    leans, _, _ = leaning(rng, 0.3)
+    expected = expected_pose(leans, np.eye(6), None)
+    np.testing.assert_array_equal(expected.T_c_w, leans)
+    np.testing.assert_array_equal(expected.prior(True).information, np.eye(6))
+    np.testing.assert_array_equal(expected.prior(False).information, np.zeros((6, 6)))
+
+
+def test_attitude_tells_a_climb_from_a_pitch_before_a_distant_wall(rng):
+    """A strip of a wall 4 m away, whose depths err by 1 % together: the images alone turn a quarter of a climb of
+    0.4 m into a pitch."""
+    rays = np.column_stack([rng.uniform([-0.5, -0.06], [0.5, 0.06], (300, 2)), np.ones(300)])
+    host_w = se3.inverse(LEVEL)
+    true_w = se3.transform(host_w, 4.0 * rays)
+    bent = 4.0 * (1.0 + 0.01 * np.sin(25.0 * rays[:, 1:2]))
+    anchors = Anchors()
+    words, colour = np.zeros((300, 4), np.uint64), np.zeros((300, 3), np.uint8)
+    ids = anchors.add(se3.transform(host_w, bent * rays), words, 0, False, colour)
+    T_w_c = host_w.copy()
+    T_w_c[2, 3] += 0.4
+    uv = CAMERA.project(se3.transform(se3.inverse(T_w_c), true_w)) + rng.normal(0, 0.5, (300, 2))
+    gravity = GravityFactor(np.zeros(1, np.int64), LEVEL[:3, 2][None], np.array([0.0, 0.0, 1.0]), math.radians(2.0))
+    held, alone = (
+        pose_on_anchors(
+            anchors, ids, uv, np.ones(300), LEVEL, CAMERA, expected_pose(LEVEL, np.zeros((6, 6)), g), PoseConfig()
+        ).T_c_w
+        for g in (gravity, None)
+    )
+    assert tilt_deg(held) < 0.8 < 1.2 < tilt_deg(alone)
+    assert se3.inverse(alone)[2, 3] < 0.3 < 0.35 < se3.inverse(held)[2, 3]

@@ -1,5 +1,7 @@
 """A frame's pose against the map, with and without a prediction."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from point_map import CAMERA, SCALE_FACTOR, filled, pose_error, small_motion
@@ -7,7 +9,7 @@ from point_map import CAMERA, SCALE_FACTOR, filled, pose_error, small_motion
 from edgeslam_torch.config import OrbConfig, TrackingConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.projection import project_anchors
-from edgeslam_torch.optim.problem import PosePrior
+from edgeslam_torch.tracking.pose_prior import ExpectedPose
 from edgeslam_torch.tracking.relocaliser import match_keyframe
 from edgeslam_torch.tracking.tracker import Tracker, make_view, median_parallax
 from edgeslam_torch.types import FrameFeatures
@@ -147,7 +149,7 @@ def test_on_predicted_depths_the_motion_prior_constrains_the_pose(points, rng):
     anchors.rest_on_prior(ids, host.id, host.centre_w, np.stack([1.0 / z, 0.5 / np.abs(z)], axis=1))
     T = points.world.T_c_w[3]
     sigma = np.array([5e-4] * 3 + [1e-2] * 3)
-    expected = PosePrior(0, T, np.diag(sigma**-2))
+    expected = ExpectedPose(T, np.diag(sigma**-2), np.zeros((6, 6)))
     tracker, view = tracker_of(points), view_of(points, 3, rng, 0.5)
     shift = se3.exp(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])) @ T
     held, free = (tracker.track(view, shift, recent(points, 3), e) for e in (expected, None))
@@ -155,6 +157,6 @@ def test_on_predicted_depths_the_motion_prior_constrains_the_pose(points, rng):
     assert np.sqrt(np.diag(free.covariance))[:3].max() > 1.5e-3
     assert pose_error(held.T_c_w, points.world.T_c_w[3])[0] < 2e-3
     anchors.from_depth[ids] = False
-    at_shift = PosePrior(0, shift, np.diag(sigma**-2))
+    at_shift = replace(expected, T_c_w=shift)
     sure = tracker.track(view, shift, recent(points, 3), at_shift)
     assert pose_error(sure.T_c_w, points.world.T_c_w[3])[0] < 0.01, "triangulated points need no such help"

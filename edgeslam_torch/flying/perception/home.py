@@ -7,6 +7,7 @@ import numpy as np
 
 from edgeslam_torch.estimation.output_frame import CONTRADICTION, SURE
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.navigation.supervisor import SCALE_SIGMA
 from edgeslam_torch.types import FloatArray, SlamOutput
 
 GROUND_M = 0.1
@@ -50,7 +51,7 @@ class Home:
         return out
 
 
-def metres_per_unit(known: float, output: SlamOutput, may_move: bool) -> float:
+def metres_per_unit(known: float, output: SlamOutput, late: bool) -> float:
     """Metres per map unit to be used from now on.
 
     The SLAM keeps its output unit until it is surely wrong, so as not to bend the trajectory; navigation needs the best
@@ -59,10 +60,11 @@ def metres_per_unit(known: float, output: SlamOutput, may_move: bool) -> float:
     Args:
         known: Current value; not finite if the scale is unknown.
         output: SLAM output of the newest frame.
-        may_move: Whether the map may be rescaled now.
+        late: Whether the last correction of the map was long ago; only an error that matters is corrected sooner.
     """
-    if not may_move or not output.metric or not math.isfinite(output.scale.sigma):
+    if not output.metric or not math.isfinite(output.scale.sigma):
         return known
     best, sigma_log = output.scale.value, output.scale.sigma / output.scale.value
     least = _OFF if sigma_log < SURE else max(_OFF, CONTRADICTION * sigma_log)
+    least = least if late else max(least, SCALE_SIGMA)
     return known if math.isfinite(known) and abs(math.log(best / known)) < least else best

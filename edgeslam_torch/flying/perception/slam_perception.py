@@ -113,8 +113,8 @@ class SlamPerception:
         shows = revised or self._frames % _DEPTH_EVERY == 0
         depth = self._depth(image, output) if shows else None
         # A new scale is only sent together with a view at that scale.
-        may_move = depth is not None and captured_s - self._moved_s > _MOVES_EVERY_S
-        metres = metres_per_unit(self._metres, output, may_move)
+        late = captured_s - self._moved_s > _MOVES_EVERY_S
+        metres = self._metres if depth is None else metres_per_unit(self._metres, output, late)
         unit = metres if np.isfinite(metres) else output.unit
         home = Home.of(T_slam[0], unit / output.unit, self._T_b_c)
         with self._lock:

@@ -12,10 +12,10 @@ from edgeslam_torch.navigation.map_views import MapViews, Places
 from edgeslam_torch.synthetic.sites.build import named_site
 
 
-def told(world, seconds, ahead_s=np.inf):
+def told(world, seconds, ahead_s=np.inf, seed=300, ready=True):
     """State and true position at each tick: up and down every 2 s, from ``ahead_s`` on straight ahead."""
-    drone, paint, camera = drone_at(named_site(world, 300), TELLO_TILT_RAD, IMAGE_SIZE)
-    tello, perception = LockstepTello(drone, paint, seed=300), SlamPerception(camera, FAULTS["none"], 300)
+    drone, paint, camera = drone_at(named_site(world, seed), TELLO_TILT_RAD, IMAGE_SIZE, ready=ready)
+    tello, perception = LockstepTello(drone, paint, seed=seed), SlamPerception(camera, FAULTS["none"], seed)
     tello.send("takeoff")
     while tello.clock_s < seconds:
         yield perception.state(tello.clock_s, tello.advance(TICK_S)), drone.p_w.copy()
@@ -52,3 +52,15 @@ def test_what_a_pilot_knows_is_moved_with_its_metres_and_the_drone_is_where_it_s
     flown = np.linalg.norm(true_w[:2])
     assert flown > 2.5
     assert np.linalg.norm(before.p_w[:2] - true_w[:2]) < 0.05 + 3.0 * before.scale_sigma * flown
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("world", "seed"), [("cluttered_room", 742), ("two_rooms", 758)])
+def test_a_climb_on_wrong_predicted_depths_is_not_taken_for_sinking(world, seed):
+    """The depth network is far off here, and the reversed order of depths explains the images: a camera that sinks
+    and turns up by 15 degrees."""
+    states = [(state, p_w[2]) for state, p_w in told(world, 8.0, seed=seed, ready=False)]
+    climb = [state.p_w[2] for state, z_m in states if z_m > 0.4 and state.stamp_s < 3.0]
+    assert np.all(np.diff(climb[::5]) > 0.0)
+    last, z_m = states[-1]
+    assert last.metric and last.scale_sigma < 0.1 and abs(last.p_w[2] - z_m) < 0.1
