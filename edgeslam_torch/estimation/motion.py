@@ -76,6 +76,8 @@ class MotionFusion:
         """The newest state message."""
         self._comparison = Comparison(self.flight)
         self._filter = FilterFeed(config, given)
+        self._begun: VisualPose | None = None
+        """Newest pose of the submap that began last, before its first tracked frame."""
         self._fitted_s = -math.inf
         """Stamp of the last fit."""
         self._counts: Counter[str] = Counter()
@@ -140,6 +142,7 @@ class MotionFusion:
             sigma_t: As for `add_visual`.
             sigma_r_rad: Likewise.
         """
+        self._begun = None
         for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
             last = self._memory.last
             if np.isfinite(T).all() and (last is None or stamp_s > last.stamp_s):
@@ -179,12 +182,18 @@ class MotionFusion:
         if (seen := self._filter.seen) is not None:
             self._filter.move_map(seen.moved(T))
 
-    def begin_piece(self) -> None:
+    def begin_piece(self, predicted: VisualPose) -> None:
         """Begin a submap at a predicted pose: the step between submaps is no motion of the camera."""
+        self._begun = predicted
         self._filter.clear()
         if self._memory.last is not None:
             self.imu.begin_submap(self._memory.last.stamp_s)
         self._memory.interrupt()
+
+    def follow_start(self, stamp_s: float, T_w_c: FloatArray) -> None:
+        """A frame's pose ``(4, 4)`` in a submap that has no map yet: no measurement, but where the camera is."""
+        if self._begun is not None:
+            self._begun = replace(self._begun, stamp_s=stamp_s, T=T_w_c)
 
     # --- output --------------------------------------------------------------------------------------------------
 
@@ -259,11 +268,13 @@ class MotionFusion:
 
     def snapshot(self) -> Snapshot | None:
         """Present motion, for other threads; ``None`` before the first tracked frame."""
-        last = self._memory.last
+        last, previous = self._memory.last, self._memory.previous
         if last is None:
             return None
+        if self._begun is not None and self._begun.stamp_s > last.stamp_s:
+            last, previous = self._begun, None
         frozen = self._filter.frozen(), self.imu.frozen()
-        return Snapshot(last, self._memory.previous, *frozen, self.scale(), self.flight.delay_sigma_s)
+        return Snapshot(last, previous, *frozen, self.scale(), self.flight.delay_sigma_s)
 
     def statistics(self) -> dict[str, float]:
         """Counters and the state of the estimates, for the report."""

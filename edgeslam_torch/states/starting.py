@@ -149,6 +149,7 @@ class Starting:
             self.system.motion.stop()
             return self.begin(frame, view, "lost sight of the first keyframe before parallax sufficed")
         self.system.motion.move(frame.stamp_s, track.T_c_w)
+        self.system.fusion.follow_start(frame.stamp_s, se3.inverse(track.T_c_w))
         leaving = track.inliers < ADOPT_SHARE * attempt.max_matched and attempt.reference.depth is not None
         with self.system.timed("initialisation"):
             two_view = attempt.two_views(frame, view, track, leaving, self.system.gravity(frame.stamp_s))

@@ -12,6 +12,7 @@ from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.estimation.snapshot import Present
+from edgeslam_torch.estimation.telemetry.visual_memory import VisualPose
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
 
@@ -118,8 +119,28 @@ def test_a_map_that_is_moved_moves_the_prediction_along(flown):
     np.testing.assert_allclose(flown.fusion.predict(15.2).T_w_c, T @ before, atol=1e-9)
 
 
+def predicted_at(flown, stamp_s):
+    """The filter's pose, as that of a frame."""
+    predicted = flown.fusion.predict(stamp_s)
+    return VisualPose(stamp_s, predicted.T_w_c, predicted.sigma_t, predicted.sigma_r_rad)
+
+
+def test_the_present_of_a_new_piece_of_map_is_where_it_begins(flown):
+    """Not where the camera was tracked last; tracked frames follow."""
+    begun = predicted_at(flown, 15.3)
+    flown.fusion.begin_piece(begun)
+    for at_s in (15.3, 15.4):
+        T_w_c = begun.T @ se3.exp(np.array([at_s - 15.0, 0.0, 0.0, 0.0, at_s - 15.0, 0.0]))
+        flown.fusion.follow_start(at_s, T_w_c)
+        now = Present(flown.fusion.snapshot()).pose_at(at_s + 0.05)
+        np.testing.assert_allclose(now.T_w_c, T_w_c, atol=1e-9)
+        assert now.covariance[0, 0] >= begun.sigma_t**2 and now.seen_s == at_s
+    flown.fly_on(18.0)
+    assert Present(flown.fusion.snapshot()).pose_at(18.0).seen_s > 17.5
+
+
 def test_a_new_piece_of_map_is_no_motion(flown):
-    flown.fusion.begin_piece()
+    flown.fusion.begin_piece(predicted_at(flown, 15.1))
     assert not flown.fusion.filtering
     leap = se3.exp(np.array([0.0, 3.0, 0.0, 0.0, 0.0, 0.0]))
     flown.fly_on(18.0, leap)
