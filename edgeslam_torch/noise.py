@@ -84,6 +84,8 @@ KNOWN_MOUNT_RAD, KNOWN_LEVER_M, KNOWN_OFFSET_S = 1e-3, 2e-3, 2e-4
 """Of calibrated values."""
 UNKNOWN_MOUNT_RAD, UNKNOWN_LEVER_M, UNKNOWN_OFFSET_S = 0.1, 0.1, 0.02
 """Of values that the model leaves out, once rotations have been compared: a camera and an IMU on one small drone."""
+SUBMAP_SCALE_LOG = 0.3
+"""Of the scale of a submap on predicted depths relative to the map before it: the network sees another scene."""
 
 # --- clocks -----------------------------------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ nothing: each tracked frame may trigger a fit, whose results are valid until the
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,8 @@ from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.estimation.filter.filter_feed import FilterFeed, PoseEstimate
 from edgeslam_torch.estimation.orientation import Orientation
 from edgeslam_torch.estimation.output_frame import OutputFrame
-from edgeslam_torch.estimation.scale.belief import disagreement
+from edgeslam_torch.estimation.scale.belief import disagreement, mean
+from edgeslam_torch.estimation.scale.submap_scale import SubmapScale
 from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
 from edgeslam_torch.estimation.sensors.height import climb
 from edgeslam_torch.estimation.sensors.imu import REACH_S as IMU_REACH_S
@@ -33,6 +35,7 @@ from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory, Visu
 from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
 from edgeslam_torch.geometry.level import Up
 from edgeslam_torch.imu import ImuModel, ImuReadings
+from edgeslam_torch.noise import SUBMAP_SCALE_LOG
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
 
 _REFIT_S = 1.0
@@ -76,6 +79,8 @@ class MotionFusion:
         """The newest state message."""
         self._comparison = Comparison(self.flight)
         self._filter = FilterFeed(config, given)
+        self.submap: SubmapScale | None = None
+        """Scale of a submap that began on predicted depths; None once it is that of the map. `MapMerging` resets it."""
         self._begun: VisualPose | None = None
         """Newest pose of the submap that began last, before its first tracked frame."""
         self._fitted_s = -math.inf
@@ -182,9 +187,15 @@ class MotionFusion:
         if (seen := self._filter.seen) is not None:
             self._filter.move_map(seen.moved(T))
 
-    def begin_piece(self, predicted: VisualPose) -> None:
-        """Begin a submap at a predicted pose: the step between submaps is no motion of the camera."""
-        self._begun = predicted
+    def begin_piece(self, stamp_s: float, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
+        """Begin a submap at a predicted pose: the step between submaps is no motion of the camera.
+
+        The submap has a scale of its own, by predicted depths, until sensors have measured it. Arguments as for
+        `add_visual`.
+        """
+        self._begun = VisualPose(stamp_s, T_w_c, sigma_t, sigma_r_rad)
+        before = self.metres.sensor_scale if self.submap is None else self.submap.before
+        self.submap = None if before is None else SubmapScale(stamp_s, before)
         self._filter.clear()
         if self._memory.last is not None:
             self.imu.begin_submap(self._memory.last.stamp_s)
@@ -250,6 +261,8 @@ class MotionFusion:
     def health(self, stamp_s: float, state: str, metric: bool) -> Health:
         """Reliability of the scale; arguments as in `present`, and whether the published unit is a metre."""
         sources, delay, scale = self.metres.sources(), self.flight.delay.delay, self.scale()
+        if self.submap is not None:
+            scale = replace(scale, sigma=math.hypot(scale.sigma, SUBMAP_SCALE_LOG * scale.value))
         doubt = self.metres.contradiction()
         return Health(
             stamp_s,
@@ -343,7 +356,8 @@ class MotionFusion:
     def _is_due(self, stamp_s: float) -> bool:
         known = self.metres.sensor_scale is not None and math.isfinite(self.flight.delay_sigma_s)
         first_s = _REFIT_S if known else _FIRST_FIT_S
-        pause_s = max(first_s, _REFIT_SHARE * min(self._memory.length_s, WINDOW_S))
+        grown_s = 0.0 if self.submap is not None else _REFIT_SHARE * min(self._memory.length_s, WINDOW_S)
+        pause_s = max(first_s, grown_s)
         return len(self._track) > 0 and (self.orientation.found is None or stamp_s - self._fitted_s >= pause_s)
 
     def _refit(self, flying: bool = True) -> None:
@@ -361,6 +375,12 @@ class MotionFusion:
         orientation.found = turned
         T_b_c, rough = orientation.T_b_c, metres.rough()
         self._comparison.judge(T_b_c, turned.R_w_m, rough, flying)
+        if self.submap is not None and flying:  # what it measures says nothing of the map before it
+            own = replace(self.flight, memory=self._memory.since(self.submap.since_s), trust=deepcopy(self._trust))
+            if len(own.memory.sightings().stamps_s) > 0:
+                found, _ = TelemetryScale(own, T_b_c, turned, rough, None, None, flying).beliefs()
+                self.submap = replace(self.submap, measured=mean(list((found or {}).values())))
+            return
         scale = TelemetryScale(self.flight, T_b_c, turned, rough, metres.network(), metres.previous_scale(), flying)
         metres.take(*scale.beliefs(), self._trust)
 

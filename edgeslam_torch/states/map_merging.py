@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from edgeslam_torch.atlas.atlas import Atlas, MapChange
-from edgeslam_torch.geometry import se3
+from edgeslam_torch.atlas.relaxation import move
+from edgeslam_torch.estimation.scale.submap_scale import SubmapScale
+from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.states.system import System
+from edgeslam_torch.types import FloatArray
 
 
 class MapMerging:
@@ -23,6 +26,8 @@ class MapMerging:
         system, changes = self.system, []
         if system.mapping.busy or not system.log.records:
             return ""
+        if system.fusion.submap is not None:
+            self._scale_submap(system.fusion.submap)
         while not self.atlas.is_up_to_date and (found := self._followed()):
             changes.append(found)
         return "; ".join(map(str, changes))
@@ -49,19 +54,45 @@ class MapMerging:
             self.atlas.search_all_again()
         self.update()
 
+    def _scale_submap(self, known: SubmapScale) -> None:
+        """Bring a submap to the map's unit, about the place where it began, once sensors have measured its own."""
+        system, graph = self.system, self.atlas.graph
+        last = system.log.records[-1].keyframe_id
+        piece = system.map.piece_of(last)
+        start = graph.starts.get(piece)
+        if start is None or start.keyframe_id != max(s.keyframe_id for s in graph.starts.values()):
+            system.fusion.submap = None  # back in the map before it
+            return
+        if not known.is_known:
+            return
+        system.fusion.submap = None
+        if known.growth == 1.0:
+            return
+        T_c_k = system.motion.T_c_w @ se3.inverse(system.map.pose_of(last))
+        began = se3.inverse(system.map.pose_of(start.keyframe_id))[:3, 3]
+        S = sim3.compose(known.growth, np.eye(3), (1.0 - known.growth) * began)
+        members = [id for id in system.map.keyframes if system.map.piece_of(id) == piece]
+        self._follow(last, T_c_k, move(system.map, self.atlas.edges, system.log, dict.fromkeys(members, S))[last])
+        system.events["scaled"] = system.events.get("scaled", 0) + 1
+
     def _followed(self) -> MapChange | None:
-        """Change the map by the next merge or loop, and transform the current pose and the metric scale with it."""
+        """Change the map by the next merge or loop."""
         system = self.system
         last = system.log.records[-1].keyframe_id
         T_c_k = system.motion.T_c_w @ se3.inverse(system.map.pose_of(last))
         change = self.atlas.update()
         if change is None:
             return None
-        scale = change.growth(last)
+        system.fusion.submap = None
+        self._follow(last, T_c_k, change.growth(last))
+        system.events[change.kind] = system.events.get(change.kind, 0) + 1
+        return change
+
+    def _follow(self, last: int, T_c_k: FloatArray, scale: float) -> None:
+        """Transform the pose ``T_c_k`` ``(4, 4)`` at a keyframe, and the metric scale, with a map that was moved."""
+        system = self.system
         system.motion.transform(se3.scaled(T_c_k, scale) @ system.map.pose_of(last), scale)
         system.compare_depths_again()
         system.fusion.revise(*system.log.poses())
         # Poses published before belong to the map before the change.
         system.published = replace(system.published, revision=system.published.revision + 1)
-        system.events[change.kind] = system.events.get(change.kind, 0) + 1
-        return change

@@ -12,7 +12,6 @@ from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.estimation.output_frame import OutputFrame, first_pose
 from edgeslam_torch.estimation.scale.depth_scale import DepthRatio, compared
-from edgeslam_torch.estimation.telemetry.visual_memory import VisualPose
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
@@ -158,7 +157,7 @@ class System:
         predicted = self.fusion.predict(keyframe.stamp_s)
         sigma = (np.inf, np.inf) if predicted is None else (predicted.sigma_t, predicted.sigma_r_rad)
         self.graph.begin(self.map.piece, keyframe, *sigma)
-        self.fusion.begin_piece(VisualPose(keyframe.stamp_s, keyframe.T_w_c, *sigma))
+        self.fusion.begin_piece(keyframe.stamp_s, keyframe.T_w_c, *sigma)
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 

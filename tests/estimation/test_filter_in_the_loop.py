@@ -12,7 +12,6 @@ from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.estimation.snapshot import Present
-from edgeslam_torch.estimation.telemetry.visual_memory import VisualPose
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
 
@@ -47,12 +46,13 @@ class Flown:
         replay(self.fusion, seen, self.gauge, self.samples, each=lambda t, i: each(i, t))
         return self
 
-    def fly_on(self, until_s, leap=None):
-        """After 15 s."""
+    def fly_on(self, until_s, leap=None, size=1.0):
+        """After 15 s, in a map that is moved by ``leap`` or is of another ``size``."""
         for i in np.flatnonzero((self.motion.stamps_s > 15.0) & (self.motion.stamps_s < until_s)):
             t, gauge = float(self.motion.stamps_s[i]), self.gauge
             self.fusion.add_telemetry([s for s in self.samples if t - 0.05 < s.stamp_s <= t])
-            T_m_c = gauge.T_m_c[i] if leap is None else leap @ gauge.T_m_c[i]
+            T_m_c = gauge.T_m_c[i].copy() if leap is None else leap @ gauge.T_m_c[i]
+            T_m_c[:3, 3] *= size
             self.fusion.add_visual(t, T_m_c, gauge.sigma_t, gauge.sigma_r)
 
     def off_m(self, T_m_c, stamp_s):
@@ -120,27 +120,51 @@ def test_a_map_that_is_moved_moves_the_prediction_along(flown):
 
 
 def predicted_at(flown, stamp_s):
-    """The filter's pose, as that of a frame."""
+    """Where a submap begins: the filter's pose and its sigmas."""
     predicted = flown.fusion.predict(stamp_s)
-    return VisualPose(stamp_s, predicted.T_w_c, predicted.sigma_t, predicted.sigma_r_rad)
+    return stamp_s, predicted.T_w_c, predicted.sigma_t, predicted.sigma_r_rad
 
 
 def test_the_present_of_a_new_piece_of_map_is_where_it_begins(flown):
     """Not where the camera was tracked last; tracked frames follow."""
     begun = predicted_at(flown, 15.3)
-    flown.fusion.begin_piece(begun)
+    flown.fusion.begin_piece(*begun)
     for at_s in (15.3, 15.4):
-        T_w_c = begun.T @ se3.exp(np.array([at_s - 15.0, 0.0, 0.0, 0.0, at_s - 15.0, 0.0]))
+        T_w_c = begun[1] @ se3.exp(np.array([at_s - 15.0, 0.0, 0.0, 0.0, at_s - 15.0, 0.0]))
         flown.fusion.follow_start(at_s, T_w_c)
         now = Present(flown.fusion.snapshot()).pose_at(at_s + 0.05)
         np.testing.assert_allclose(now.T_w_c, T_w_c, atol=1e-9)
-        assert now.covariance[0, 0] >= begun.sigma_t**2 and now.seen_s == at_s
+        assert now.covariance[0, 0] >= begun[2] ** 2 and now.seen_s == at_s
     flown.fly_on(18.0)
     assert Present(flown.fusion.snapshot()).pose_at(18.0).seen_s > 17.5
 
 
+@pytest.mark.parametrize("size", [0.6, 1.0, 1.8])
+def test_a_new_piece_of_map_has_a_scale_of_its_own(flown, size):
+    """It says nothing of the map before it, and is uncertain until sensors have measured it."""
+    before = flown.fusion.scale()
+    flown.fusion.begin_piece(*predicted_at(flown, 15.1))
+    uncertain = flown.fusion.health(15.1, "tracking", True).scale
+    assert uncertain.sigma > 0.2 * uncertain.value and not flown.fusion.submap.is_known
+    flown.fly_on(20.0, size=size)
+    assert flown.fusion.submap.is_known
+    assert flown.fusion.submap.growth == pytest.approx(1.0 / size, rel=0.05)
+    assert flown.fusion.scale() == before
+    flown.fusion.submap = None
+    assert flown.fusion.health(20.0, "tracking", True).scale == before
+
+
+def test_a_piece_that_begins_in_a_new_one_is_of_the_same_map(flown):
+    """Its scale before is that of the first."""
+    before = flown.fusion.metres.sensor_scale
+    flown.fusion.begin_piece(*predicted_at(flown, 15.1))
+    flown.fly_on(16.0, size=3.0)
+    flown.fusion.begin_piece(*predicted_at(flown, 16.0))
+    assert (flown.fusion.submap.before, flown.fusion.submap.since_s) == (before, 16.0)
+
+
 def test_a_new_piece_of_map_is_no_motion(flown):
-    flown.fusion.begin_piece(predicted_at(flown, 15.1))
+    flown.fusion.begin_piece(*predicted_at(flown, 15.1))
     assert not flown.fusion.filtering
     leap = se3.exp(np.array([0.0, 3.0, 0.0, 0.0, 0.0, 0.0]))
     flown.fly_on(18.0, leap)

@@ -7,6 +7,8 @@ import pytest
 
 from edgeslam_torch.atlas.atlas import MapChange
 from edgeslam_torch.estimation.output_frame import OutputFrame
+from edgeslam_torch.estimation.scale.belief import ScaleBelief
+from edgeslam_torch.estimation.scale.submap_scale import SubmapScale
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.states.map_merging import MapMerging
 from edgeslam_torch.tracking.motion_model import MotionModel
@@ -58,6 +60,7 @@ def system_of(pieces, motion, busy=False):
     revised = []
     remembered = []
     fusion = SimpleNamespace(
+        submap=None,
         revise=lambda *poses: revised.append(poses),
         revised=revised,
         scale=lambda: ScaleEstimate(2.0, 0.02, "telemetry"),
@@ -150,3 +153,52 @@ def test_the_axes_of_an_earlier_flight_apply_in_its_map(rng, turned):
     np.testing.assert_array_equal(system.published.R, np.eye(3))
     assert system.published.revision == 2 * int(turned)
     assert system.published.turned_upright(R_w_m, True) is system.published
+
+
+def scaling(rng, monkeypatch, piece, measured, sigma=0.03):
+    """A camera in a submap that began at keyframe 5, whose scale is measured at half of the map's: what was moved."""
+    T_k_w, motion = moving(rng)
+    pieces = Pieces(T_k_w)
+    pieces.keyframes, pieces.piece_of = {3: 0, 5: 1, KEYFRAME: piece}, lambda id: pieces.keyframes[id]
+    began, moved = se3.exp(rng.normal(size=6)), []
+    pieces.pose_of = lambda id: began if id == 5 else pieces.T_k_w
+    system = system_of(pieces, motion)
+    atlas = pieces.atlas(moved=1)
+    atlas.graph = SimpleNamespace(starts={1: SimpleNamespace(keyframe_id=5)})
+    atlas.is_up_to_date, atlas.edges = True, None
+    before = ScaleBelief(0.3, 0.02, "telemetry")
+    found = ScaleBelief(0.3 + np.log(measured), sigma, "height")
+    system.fusion.submap = SubmapScale(0.0, before, found)
+
+    def move(slam_map, edges, log, S):
+        moved.append(S)
+        pieces.T_k_w = sim3.moved_camera(S[KEYFRAME], pieces.T_k_w)
+        return dict.fromkeys(S, sim3.scale_of(S[KEYFRAME]))
+
+    monkeypatch.setattr("edgeslam_torch.states.map_merging.move", move)
+    p = rng.normal(size=(20, 3))
+    views = [se3.transform(motion.T_c_w, p)]
+    MapMerging(system, atlas).update()
+    if moved:
+        p = sim3.transform(moved[0][KEYFRAME], p)
+    views.append(se3.transform(motion.T_c_w, p))
+    return system, moved, se3.inverse(began)[:3, 3], views
+
+
+def test_a_submap_is_brought_to_the_maps_unit_about_its_beginning(rng, monkeypatch):
+    system, (S,), began, (before, after) = scaling(rng, monkeypatch, 1, measured=0.5)
+    assert set(S) == {5, KEYFRAME}, "of this submap alone"
+    np.testing.assert_allclose(sim3.transform(S[5], began[None])[0], began, atol=1e-12)
+    np.testing.assert_allclose(after, 0.5 * before, atol=1e-9)
+    assert system.fusion.submap is None and system.published.revision == 1 and system.events == {"scaled": 1}
+
+
+@pytest.mark.parametrize(
+    ("piece", "measured", "sigma", "settled"),
+    [(1, 0.97, 0.03, True), (1, 0.5, 0.2, False), (0, 0.5, 0.03, True)],
+    ids=["of the map's unit", "not yet known", "back in the first submap"],
+)
+def test_other_submaps_stay(rng, monkeypatch, piece, measured, sigma, settled):
+    system, moved, _, (before, after) = scaling(rng, monkeypatch, piece, measured, sigma)
+    np.testing.assert_array_equal(before, after)
+    assert not moved and (system.fusion.submap is None) == settled

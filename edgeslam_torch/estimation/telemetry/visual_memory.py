@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Collection
+from copy import copy
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -140,6 +141,14 @@ class VisualMemory:
             self._unbroken.append(not self._interrupted)
             self._interrupted = False
             self._shown = self._displacements = None
+
+    def since(self, stamp_s: float) -> "VisualMemory":
+        """A copy with the frames since a stamp alone."""
+        other, kept = copy(self), [k for k, v in enumerate(self._sightings) if v.stamp_s >= stamp_s]
+        other._sightings = deque((self._sightings[k] for k in kept), self._sightings.maxlen)
+        other._unbroken = deque((self._unbroken[k] and k > kept[0] for k in kept), self._unbroken.maxlen)
+        other._shown = other._displacements = None
+        return other
 
     def interrupt(self) -> None:
         """End the current displacement: tracking was lost."""

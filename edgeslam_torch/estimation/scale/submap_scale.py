@@ -1,0 +1,41 @@
+"""Scale of a submap that began on predicted depths, relative to the map before it."""
+
+import math
+from dataclasses import dataclass
+
+from edgeslam_torch.estimation.scale.belief import ScaleBelief, contradict
+
+_SURE = 0.1
+"""Relative sigma from which on the submap's scale counts as measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class SubmapScale:
+    """What sensors have measured since a submap began."""
+
+    since_s: float
+    """Stamp of its first frame."""
+    before: ScaleBelief
+    """Metres per map unit when it began."""
+    measured: ScaleBelief | None = None
+    """Metres per unit of the submap."""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it is measured."""
+        return self.measured is not None and self.measured.sigma < _SURE
+
+    @property
+    def growth(self) -> float:
+        """Factor by which the submap has to grow to be in the map's unit; 1 unless both contradict each other.
+
+        Example:
+            >>> before = ScaleBelief(0.0, 0.02, "telemetry")
+            >>> SubmapScale(0.0, before, ScaleBelief(math.log(0.5), 0.05, "height")).growth
+            0.5
+            >>> SubmapScale(0.0, before, ScaleBelief(math.log(0.95), 0.05, "height")).growth
+            1.0
+        """
+        if self.measured is None or not self.is_known or not contradict(self.measured, self.before):
+            return 1.0
+        return math.exp(self.measured.log_scale - self.before.log_scale)
