@@ -26,6 +26,7 @@ from edgeslam_torch.estimation.sensors.velocity import displacements
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.gate import consistent
 from edgeslam_torch.geometry.robust_statistics import tukey_weight
+from edgeslam_torch.noise import MOUNT_RAD
 from edgeslam_torch.types import FloatArray
 
 _LEAST_WEIGHT = 1e-4
@@ -74,6 +75,8 @@ class TelemetryModel:
     """Whether attitude is usable."""
     new_map: bool = False
     """Whether the map is only seconds old."""
+    mount_sigma_rad: float = MOUNT_RAD
+    """Standard deviation per axis of the camera's mount."""
     gain_sigma: tuple[float, ...] = (0.0, 0.0, 0.0)
     """Relative standard deviation of each velocity column, beyond that of the scale."""
 

@@ -35,7 +35,7 @@ from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory, Visu
 from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
 from edgeslam_torch.geometry.level import Up
 from edgeslam_torch.imu import ImuModel, ImuReadings
-from edgeslam_torch.noise import SUBMAP_SCALE_LOG
+from edgeslam_torch.noise import MOUNT_RAD, SUBMAP_SCALE_LOG
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
 
 _REFIT_S = 1.0
@@ -336,6 +336,7 @@ class MotionFusion:
             heights[0] if scale is not None and heights and "height" not in self.metres.decided.rejected else None,
             self.metres.fit.truncates,
             self._trust.attitude,
+            mount_sigma_rad=MOUNT_RAD if orientation.found is None else float(orientation.found.sigma_rad[:2].max()),
             gain_sigma=self._trust.gain_sigma,
         )
 

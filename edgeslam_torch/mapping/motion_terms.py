@@ -11,6 +11,7 @@ from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.noise import ATTITUDE_RAD
 from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
+from edgeslam_torch.types import FloatArray
 
 EFFECTIVE_SAMPLES = 120.0
 """Number of correlated reprojections that count as one in flight. Keypoint errors are correlated: thousands of
@@ -35,16 +36,36 @@ class MotionFactors:
     headings: tuple[HeadingFactor, ...] = ()
 
 
-def gravity_since(model: TelemetryModel | None, reference: Keyframe, stamp_s: float) -> GravityFactor | None:
-    """The vertical in one frame, pose 0, by one attitude of the drone, in a world in which a keyframe's is right; None
-    without attitude."""
+@dataclass(frozen=True, slots=True)
+class Vertical:
+    """The vertical in one frame by one attitude of the drone, in a world in which it is right in a keyframe."""
+
+    up_c: FloatArray
+    """``(3,)`` unit vector, camera axes."""
+    up_w: FloatArray
+    """``(3,)`` the same in the world."""
+    sigma_rad: float
+    """Standard deviation per axis of a single attitude."""
+    mount_rad: float = 0.0
+    """The same by the camera's mount: its error turns with the drone, and no other frame reduces it."""
+
+    def sigma(self, samples: float) -> float:
+        """Standard deviation per axis [rad], if this number of correlated reprojections counts as one."""
+        return math.hypot(self.sigma_rad / math.sqrt(samples), self.mount_rad)
+
+
+def vertical_since(model: TelemetryModel | None, reference: Keyframe, stamp_s: float) -> Vertical | None:
+    """The vertical in a frame, in the world of a keyframe; None without attitude."""
     if model is None or len(model.track) == 0 or model.track.readings.stamp_s[0] > reference.stamp_s:
         return None
     # The picture is older than it arrives: the first ones are older than the first message.
-    up = model.up(np.maximum([reference.stamp_s, stamp_s], model.track.readings.stamp_s[0] + model.delay_s))
+    stamps_s = np.maximum([reference.stamp_s, stamp_s], model.track.readings.stamp_s[0] + model.delay_s)
+    up = model.up(stamps_s)
     if up is None or len(up.frame) < 2:
         return None
-    return GravityFactor(np.zeros(1, dtype=np.int64), up.up_c[1:], reference.T_w_c[:3, :3] @ up.up_c[0], up.sigma_rad)
+    turned = float(np.diff(model.track.yaw(stamps_s - model.delay_s))[0])
+    mount_rad = 2.0 * abs(math.sin(0.5 * turned)) * model.mount_sigma_rad
+    return Vertical(up.up_c[1], reference.T_w_c[:3, :3] @ up.up_c[0], up.sigma_rad, mount_rad)
 
 
 def motion_factors(

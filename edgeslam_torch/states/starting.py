@@ -152,7 +152,7 @@ class Starting:
         self.system.fusion.follow_start(frame.stamp_s, se3.inverse(track.T_c_w))
         leaving = track.inliers < ADOPT_SHARE * attempt.max_matched and attempt.reference.depth is not None
         with self.system.timed("initialisation"):
-            two_view = attempt.two_views(frame, view, track, leaving, self.system.gravity(frame.stamp_s))
+            two_view = attempt.two_views(frame, view, track, leaving)
         if two_view.structure is None and leaving:
             with self.system.timed("mapping"), self.system.map.lock:
                 started = attempt.adopt(frame, view, track)

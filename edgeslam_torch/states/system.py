@@ -18,9 +18,8 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
-from edgeslam_torch.mapping.motion_terms import gravity_since
+from edgeslam_torch.mapping.motion_terms import vertical_since
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
-from edgeslam_torch.optim.problem import GravityFactor
 from edgeslam_torch.stage_times import timed
 from edgeslam_torch.tracking.motion_model import MotionModel
 from edgeslam_torch.tracking.pose_prior import ExpectedPose, expected_pose
@@ -117,11 +116,7 @@ class System:
         """The predicted pose, levelled by the drone's attitude, with the uncertainty due to accelerations."""
         metric = self.mapping.has_metres
         motion = self.motion.information(stamp_s, self.published.scale) if metric else np.zeros((6, 6))
-        return expected_pose(T_predicted, motion, self.gravity(stamp_s))
-
-    def gravity(self, stamp_s: float) -> GravityFactor | None:
-        """The vertical in a frame, in the world of the newest keyframe; None without attitude."""
-        return gravity_since(self.telemetry("every"), self.map.latest(), stamp_s)
+        return expected_pose(T_predicted, motion, vertical_since(self.telemetry("every"), self.map.latest(), stamp_s))
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""

@@ -11,7 +11,7 @@ from edgeslam_torch.map.keyframe import Keyframe, make_keyframe, tracked_motion
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.prior_anchors import prior_of
 from edgeslam_torch.mapping.refinement import Window, refine
-from edgeslam_torch.optim.problem import GravityFactor, LmConfig
+from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.initialiser import (
     MIN_POINTS,
     BootstrapView,
@@ -147,9 +147,7 @@ class Bootstrap:
         keypoint_of_anchor[self.reference.anchor] = np.arange(len(self.reference.anchor))
         return keypoint_of_anchor[track.matched_anchor]
 
-    def two_views(
-        self, frame: Frame, view: View, track: Track, leaving: bool = False, gravity: GravityFactor | None = None
-    ) -> TwoView:
+    def two_views(self, frame: Frame, view: View, track: Track, leaving: bool = False) -> TwoView:
         """Store the frame's matches and estimate the structure of all frames so far from those of corners.
 
         Keypoints on edges slide along them (aperture problem): hundreds on a panelled wall fit an essential matrix of a
@@ -160,7 +158,6 @@ class Bootstrap:
             view: Its features.
             track: Its matches.
             leaving: Whether it is the last one that sees enough of the reference.
-            gravity: The vertical in it.
         """
         reference, camera, keypoint = self.reference, self.tracker.camera, track.matched_keypoint
         reference_keypoint = self._reference_keypoints(track)
@@ -183,7 +180,7 @@ class Bootstrap:
             return TwoView("no parallax yet", angle)
         p_r = camera.back_project(reference.features.uv[reference_keypoint], self.guess_depth[reference_keypoint])
         guess = Structure(track.T_c_w, reference_keypoint, keypoint, se3.transform(reference.T_w_c, p_r))
-        best = self._most_probable(view, guess, gravity)
+        best = self._most_probable(view, guess)
         structure = best.structure
         angle = self._rotation_residual(view, structure.reference_keypoint, structure.keypoint)  # without outliers
         if angle < awaited:
@@ -208,7 +205,7 @@ class Bootstrap:
         """Whether there is no depth network."""
         return self.reference.depth is None
 
-    def _most_probable(self, view: View, guess: Structure, gravity: GravityFactor | None) -> Consensus:
+    def _most_probable(self, view: View, guess: Structure) -> Consensus:
         """The more probable of two minima under the network's depth, refined by the images alone.
 
         The result has the standard deviation under the prior: a flat valley of the reprojection error looks sharp where
@@ -216,15 +213,15 @@ class Bootstrap:
         """
         reference, camera, between = self.reference, self.tracker.camera, self.views[:-1]
         prior = None if self._alone else self.prior[guess.reference_keypoint]
-        minima = [consensus(reference, guess, view, between, [v.T_c_w for v in between], camera, prior, gravity)]
+        minima = [consensus(reference, guess, view, between, [v.T_c_w for v in between], camera, prior)]
         moved = from_essential_matrix(reference, guess, view, camera, self.seed)
         if moved is not None:
-            minima.append(consensus(reference, moved, view, between, self._poses(moved), camera, prior, gravity))
+            minima.append(consensus(reference, moved, view, between, self._poses(moved), camera, prior))
         best = min(minima, key=lambda minimum: minimum.cost)
         logger.debug("initialisation: %s", minima)
         if prior is None or len(best.structure.p_w) == 0:
             return best
-        free = consensus(reference, best.structure, view, between, self._poses(best.structure), camera, None, gravity)
+        free = consensus(reference, best.structure, view, between, self._poses(best.structure), camera)
         return replace(free, direction_sigma=best.direction_sigma)
 
     def _poses(self, structure: Structure) -> list[FloatArray]:

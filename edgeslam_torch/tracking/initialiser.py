@@ -7,7 +7,6 @@ jointly under the predicted depths, from tracking and from the essential matrix.
 once its covariance tells rotation from translation; then the images alone refine it, at the scale of the prediction.
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,10 +16,9 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.geometry.triangulation import bearings, parallax, triangulate
 from edgeslam_torch.map.keyframe import Keyframe
-from edgeslam_torch.mapping.motion_terms import GUESSED
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.pose_only import refine_pose
-from edgeslam_torch.optim.problem import DepthPriors, GravityFactor, LmConfig, ScalePrior, WindowProblem
+from edgeslam_torch.optim.problem import DepthPriors, LmConfig, ScalePrior, WindowProblem
 from edgeslam_torch.tracking.relative_pose import relative_pose
 from edgeslam_torch.tracking.tracker import View
 from edgeslam_torch.types import FloatArray, IntArray, NDArray
@@ -161,7 +159,6 @@ def consensus(
     poses: list[FloatArray],
     camera: Camera,
     prior: FloatArray | None = None,
-    gravity: GravityFactor | None = None,
 ) -> Consensus:
     """Refine the reference and the newest frame jointly with some intermediate ones, which observe the same points.
 
@@ -174,7 +171,6 @@ def consensus(
         camera: Intrinsics.
         prior: Expected inverse depth of the points in the reference and its standard deviation ``(M, 2)``, which fix
             the scale; without them the baseline keeps its length.
-        gravity: The vertical in the newest frame by one attitude.
     """
     chosen: IntArray = (
         np.unique(np.linspace(0, len(views) - 1, min(MAX_VIEWS, len(views))).astype(int)) if views else np.zeros(0, int)
@@ -211,7 +207,6 @@ def consensus(
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
         scale_priors=(ScalePrior(0, newest, baseline, 0.001),) if depths is None else (),
         depth_priors=depths,
-        gravity=() if gravity is None else (_weighed(gravity, newest),),
     )
     result = refine_window(problem, LmConfig(max_iterations=20, diagnostics=True))
     agreeing = result.chi2 <= CHI2_2DOF_95
@@ -220,11 +215,6 @@ def consensus(
     sigma = float(np.sqrt(np.trace(covariance))) / baseline if np.isfinite(covariance).all() else np.inf
     refined = replace(structure, T_c_w=result.T_c_w[newest], p_w=result.p_w)
     return Consensus(refined.at(agreeing[:count] & agreeing[-count:]), float(agreeing.mean()), sigma, result.cost_after)
-
-
-def _weighed(gravity: GravityFactor, pose: int) -> GravityFactor:
-    """The vertical in a frame whose motion rests on predicted depths."""
-    return replace(gravity, pose=np.array([pose]), sigma_rad=gravity.sigma_rad / math.sqrt(GUESSED))
 
 
 def _baseline(T_c_w: FloatArray) -> float:

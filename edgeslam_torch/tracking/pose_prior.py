@@ -7,10 +7,10 @@ import numpy as np
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.rotations import smallest_rotation
 from edgeslam_torch.map.anchors import Anchors
-from edgeslam_torch.mapping.motion_terms import ATTITUDE, EFFECTIVE_SAMPLES, GUESSED
+from edgeslam_torch.mapping.motion_terms import ATTITUDE, EFFECTIVE_SAMPLES, GUESSED, Vertical
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
 from edgeslam_torch.optim.pose_only import PoseConfig, PoseResult, refine_pose
-from edgeslam_torch.optim.problem import GravityFactor, PosePrior
+from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray, IntArray
 
 
@@ -22,8 +22,8 @@ class ExpectedPose:
     """``(4, 4)``; the vertical is where the drone's attitude has it, if that is known."""
     motion: FloatArray
     """``(6, 6)`` information of a left perturbation, limited by accelerations; zero without a scale."""
-    level: FloatArray
-    """``(6, 6)`` the same of the vertical by one attitude; zero without any."""
+    vertical: Vertical | None = None
+    """By the drone's attitude."""
 
     def prior(self, on_predicted_depths: bool) -> PosePrior:
         """The prior with the weight of attitude in windows, see `mapping.motion_terms`.
@@ -31,26 +31,28 @@ class ExpectedPose:
         Images of few and distant points, or of one plane, hardly distinguish a climb from a pitch, so that attitude
         counts in every frame. On predicted depths, whose errors are common to the whole image, the motion counts, too.
         """
-        if on_predicted_depths:
-            return PosePrior(0, self.T_c_w, self.motion + GUESSED * self.level)
-        return PosePrior(0, self.T_c_w, ATTITUDE * EFFECTIVE_SAMPLES * self.level)
+        information = self.motion.copy() if on_predicted_depths else np.zeros((6, 6))
+        if self.vertical is not None:
+            samples = GUESSED if on_predicted_depths else ATTITUDE * EFFECTIVE_SAMPLES
+            up_c = self.vertical.up_c
+            across = np.eye(3) - np.outer(up_c, up_c)
+            information[3:, 3:] += across / self.vertical.sigma(samples) ** 2
+        return PosePrior(0, self.T_c_w, information)
 
 
-def expected_pose(T_c_w: FloatArray, motion: FloatArray, gravity: GravityFactor | None) -> ExpectedPose:
+def expected_pose(T_c_w: FloatArray, motion: FloatArray, vertical: Vertical | None) -> ExpectedPose:
     """A predicted pose ``(4, 4)``, turned about its centre so that the vertical is where it was measured.
 
     Args:
         T_c_w: The prediction.
         motion: Its information ``(6, 6)``.
-        gravity: The vertical in the frame by one attitude.
+        vertical: The vertical in the frame by one attitude.
     """
-    level = np.zeros((6, 6))
-    if gravity is None:
-        return ExpectedPose(T_c_w, motion, level)
-    T, up_c = T_c_w.copy(), gravity.up_c[0]
-    T[:3] = smallest_rotation(T_c_w[:3, :3] @ gravity.up_w, up_c) @ T_c_w[:3]
-    level[3:, 3:] = (np.eye(3) - np.outer(up_c, up_c)) / gravity.sigma_rad**2
-    return ExpectedPose(T, motion, level)
+    if vertical is None:
+        return ExpectedPose(T_c_w, motion)
+    T = T_c_w.copy()
+    T[:3] = smallest_rotation(T_c_w[:3, :3] @ vertical.up_w, vertical.up_c) @ T_c_w[:3]
+    return ExpectedPose(T, motion, vertical)
 
 
 def pose_on_anchors(

@@ -20,7 +20,7 @@ from edgeslam_torch.map.keyframe import NO_ANCHOR
 from edgeslam_torch.map.revisit import MIN_SHARED, is_back
 from edgeslam_torch.mapping.last_refinement import lm_config
 from edgeslam_torch.mapping.mapper import Mapper
-from edgeslam_torch.mapping.motion_terms import EFFECTIVE_SAMPLES, gravity_since, motion_factors
+from edgeslam_torch.mapping.motion_terms import EFFECTIVE_SAMPLES, motion_factors, vertical_since
 from edgeslam_torch.mapping.refinement import (
     Window,
     recent_map,
@@ -294,15 +294,15 @@ def test_the_vertical_since_a_keyframe_is_in_the_world_of_its_pose(rng, halves, 
     reference.stamp_s += model.delay_s - early_s
     true = halves.world.T_c_w[5] @ se3.inverse(halves.world.T_c_w[0])
     reference.T_c_w = reference.T_c_w @ se3.exp(np.array([0.5, 0.0, 1.0, 0.3, -0.2, 0.1]))
-    found = gravity_since(model, reference, newest.stamp_s + model.delay_s)
-    np.testing.assert_allclose(found.up_c[0], true[:3, :3] @ reference.T_c_w[:3, :3] @ found.up_w, atol=1e-3)
+    found = vertical_since(model, reference, newest.stamp_s + model.delay_s)
+    np.testing.assert_allclose(found.up_c, true[:3, :3] @ reference.T_c_w[:3, :3] @ found.up_w, atol=1e-3)
 
 
 def test_the_vertical_since_a_keyframe_needs_a_message_before_it(rng, halves):
     reference, at_s = halves.keyframes[0], halves.keyframes[-1].stamp_s
     reference.stamp_s = -2.0
-    assert gravity_since(telemetry_of(rng, halves), reference, at_s) is None
-    assert gravity_since(None, reference, at_s) is None
+    assert vertical_since(telemetry_of(rng, halves), reference, at_s) is None
+    assert vertical_since(None, reference, at_s) is None
 
 
 def test_a_whole_map_may_use_the_full_weight_of_telemetry(rng, halves):

@@ -10,7 +10,7 @@ from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map, small_motion
 from edgeslam_torch.config import InitialisationConfig, OrbConfig, TrackingConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import make_keyframe
-from edgeslam_torch.optim.problem import GravityFactor, LmConfig
+from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking import bootstrap as bootstrap_module
 from edgeslam_torch.tracking.bootstrap import Bootstrap
 from edgeslam_torch.tracking.initialiser import (
@@ -273,14 +273,13 @@ def test_an_abandoned_initialisation_removes_its_anchors(points):
 # -- what may become the map -----------------------------------------------------------------------------------------
 
 
-def seen_by(points, views, guess_depth=None, wrong_between=0.0, tracked=None, gravity=None, **config):
+def seen_by(points, views, guess_depth=None, wrong_between=0.0, tracked=None, **config):
     """What the last of some views offers after the others.
 
     Args:
         guess_depth: Predicted depths; the true ones by default.
         wrong_between: Share of the matches in the views between that point anywhere.
         tracked: Pose of tracking in the last view in place of its own.
-        gravity: The vertical in the last view.
     """
     guess_depth = points.depths(0) if guess_depth is None else guess_depth
     bootstrap = make_bootstrap(points, guess_depth, InitialisationConfig(**config))
@@ -289,8 +288,7 @@ def seen_by(points, views, guess_depth=None, wrong_between=0.0, tracked=None, gr
         track = bootstrap.track(view_of(points, view), points.world.T_c_w[view])
         if view == views[-1] and tracked is not None:
             track = replace(track, T_c_w=tracked)
-        leaving = len(views) == 1
-        found = bootstrap.two_views(frame_of(points, view), view_of(points, view), track, leaving, gravity)
+        found = bootstrap.two_views(frame_of(points, view), view_of(points, view), track, leaving=len(views) == 1)
         uv = bootstrap.views[-1].keypoint_uv
         wrong = rng.permutation(len(uv))[: round(wrong_between * len(uv))]
         uv[wrong] = rng.uniform((0, 0), (640, 480), (len(wrong), 2))
@@ -368,23 +366,6 @@ def test_the_network_resolves_the_ambiguity_of_a_plane(seed, wrong, monkeypatch)
     found = seen_by(points, (4,), tracked=T if wrong == "tracking" else None, max_direction_sigma=10.0)
     assert found.structure is not None, found.reason
     assert np.abs(se3.log(found.structure.T_c_w @ se3.inverse(true))).max() < 0.05
-
-
-@pytest.mark.parametrize("levelled", [True, False])
-def test_the_vertical_resolves_the_ambiguity_where_the_network_is_wrong(levelled, monkeypatch):
-    """The network predicts the depths of the other explanation."""
-    points = on_a_plane(PointMap(np.random.default_rng(1), 400, 6))
-    with_network(points)
-    right = guess_of(points, points.depths(0))
-    T, p_w = other_explanation(points, right)
-    depth = points.depths(0)
-    depth[right.reference_keypoint] = se3.transform(points.world.T_c_w[0], p_w)[:, 2]
-    from_essential_matrix_comes(monkeypatch, replace(right, T_c_w=T, p_w=p_w))
-    true, up_w = points.world.T_c_w[4], np.array([0.0, 0.0, 1.0])
-    gravity = GravityFactor(np.zeros(1, np.int64), (true[:3, :3] @ up_w)[None], up_w, np.deg2rad(2.0))
-    found = seen_by(points, (4,), depth, gravity=gravity if levelled else None, max_direction_sigma=10.0).structure
-    tilt = np.rad2deg(np.arccos(min(1.0, found.T_c_w[:3, 2] @ true[:3, 2])))
-    assert (tilt < 0.5) == levelled
 
 
 @pytest.mark.parametrize("network", [True, False])

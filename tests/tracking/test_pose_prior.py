@@ -1,6 +1,7 @@
 """A frame's pose with the predicted one as a prior: a climb and a turn look alike on guessed depths."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,8 +9,8 @@ import pytest
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.anchors import Anchors
+from edgeslam_torch.mapping.motion_terms import Vertical
 from edgeslam_torch.optim.pose_only import PoseConfig
-from edgeslam_torch.optim.problem import GravityFactor
 from edgeslam_torch.tracking.pose_prior import ExpectedPose, expected_pose, pose_on_anchors
 
 CAMERA = Camera(640, 480, 460.0, 460.0, 320.0, 240.0)
@@ -39,7 +40,7 @@ def wall(rng):
 
 def solved(wall, sigma_rad):
     anchors, ids, uv = wall
-    expected = ExpectedPose(LEVEL, np.diag([1.0] * 3 + [sigma_rad**-2] * 3), np.zeros((6, 6)))
+    expected = ExpectedPose(LEVEL, np.diag([1.0] * 3 + [sigma_rad**-2] * 3))
     return pose_on_anchors(anchors, ids, uv, np.ones(len(ids)), LEVEL, CAMERA, expected, PoseConfig())
 
 
@@ -66,27 +67,31 @@ def leaning(rng, angle_rad):
     upright = LEVEL @ se3.exp(np.array([1.0, -2.0, 0.5, 0.0, 0.0, rng.uniform(-3.0, 3.0)]))
     lean = upright[:3, :3] @ [math.cos(axis), math.sin(axis), 0.0]
     leans = se3.exp(np.concatenate([np.zeros(3), angle_rad * lean])) @ upright
-    up_w = np.array([0.0, 0.0, 1.0])
-    return leans, upright, GravityFactor(np.zeros(1, np.int64), upright[:3, 2][None], up_w, math.radians(0.2))
+    return leans, upright, Vertical(upright[:3, 2], np.array([0.0, 0.0, 1.0]), math.radians(2.0))
 
 
 def test_a_levelled_prediction_keeps_its_centre_and_its_heading(rng):
-    leans, upright, gravity = leaning(rng, 0.3)
-    np.testing.assert_allclose(expected_pose(leans, np.zeros((6, 6)), gravity).T_c_w, upright, atol=1e-9)
+    leans, upright, vertical = leaning(rng, 0.3)
+    np.testing.assert_allclose(expected_pose(leans, np.zeros((6, 6)), vertical).T_c_w, upright, atol=1e-9)
 
 
 def test_of_a_levelled_prediction_the_vertical_is_known(rng):
-    leans, _, gravity = leaning(rng, 0.3)
-    up_c, motion = gravity.up_c[0], np.diag([4.0] * 3 + [9.0] * 3)
-    expected = expected_pose(leans, motion, gravity)
-    assert np.count_nonzero(expected.level[:3]) == np.count_nonzero(expected.level[:, :3]) == 0
-    np.testing.assert_allclose(expected.level[3:, 3:] @ up_c, 0.0, atol=1e-6)
-    across = np.cross(up_c, [0.3, -0.5, 0.8])
-    np.testing.assert_allclose(expected.level[3:, 3:] @ across, across / gravity.sigma_rad**2, rtol=1e-9)
+    leans, _, vertical = leaning(rng, 0.3)
+    up_c, motion = vertical.up_c, np.diag([4.0] * 3 + [9.0] * 3)
+    expected = expected_pose(leans, motion, vertical)
     on_depths, triangulated = (expected.prior(rests).information for rests in (True, False))
-    assert on_depths[3:, 3:] @ across @ across > 5.0 * (triangulated[3:, 3:] @ across @ across) > 0.0
     np.testing.assert_allclose(on_depths[:3], motion[:3])
-    assert np.count_nonzero(triangulated[:3]) == 0
+    assert np.count_nonzero(triangulated[:3]) == np.count_nonzero(triangulated[:, :3]) == 0
+    np.testing.assert_allclose(triangulated[3:, 3:] @ up_c, 0.0, atol=1e-6)
+    across = np.cross(up_c, [0.3, -0.5, 0.8])
+    assert np.dot(on_depths[3:, 3:] @ across, across) > 5.0 * np.dot(triangulated[3:, 3:] @ across, across) > 0.0
+
+
+def test_an_error_of_the_mount_counts_as_often_as_the_drone_turns(rng):
+    leans, _, vertical = leaning(rng, 0.3)
+    turned = expected_pose(leans, np.zeros((6, 6)), replace(vertical, mount_rad=0.1))
+    for rests in (True, False):
+        assert np.abs(turned.prior(rests).information).max() <= 0.1**-2
 
 
 def test_without_attitude_a_prediction_stays(rng):
@@ -110,12 +115,12 @@ def test_attitude_tells_a_climb_from_a_pitch_before_a_distant_wall(rng):
     T_w_c = host_w.copy()
     T_w_c[2, 3] += 0.4
     uv = CAMERA.project(se3.transform(se3.inverse(T_w_c), true_w)) + rng.normal(0, 0.5, (300, 2))
-    gravity = GravityFactor(np.zeros(1, np.int64), LEVEL[:3, 2][None], np.array([0.0, 0.0, 1.0]), math.radians(2.0))
+    vertical = Vertical(LEVEL[:3, 2], np.array([0.0, 0.0, 1.0]), math.radians(2.0))
     held, alone = (
         pose_on_anchors(
             anchors, ids, uv, np.ones(300), LEVEL, CAMERA, expected_pose(LEVEL, np.zeros((6, 6)), g), PoseConfig()
         ).T_c_w
-        for g in (gravity, None)
+        for g in (vertical, None)
     )
     assert tilt_deg(held) < 0.8 < 1.2 < tilt_deg(alone)
     assert se3.inverse(alone)[2, 3] < 0.3 < 0.35 < se3.inverse(held)[2, 3]

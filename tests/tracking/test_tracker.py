@@ -149,7 +149,7 @@ def test_on_predicted_depths_the_motion_prior_constrains_the_pose(points, rng):
     anchors.rest_on_prior(ids, host.id, host.centre_w, np.stack([1.0 / z, 0.5 / np.abs(z)], axis=1))
     T = points.world.T_c_w[3]
     sigma = np.array([5e-4] * 3 + [1e-2] * 3)
-    expected = ExpectedPose(T, np.diag(sigma**-2), np.zeros((6, 6)))
+    expected = ExpectedPose(T, np.diag(sigma**-2))
     tracker, view = tracker_of(points), view_of(points, 3, rng, 0.5)
     shift = se3.exp(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])) @ T
     held, free = (tracker.track(view, shift, recent(points, 3), e) for e in (expected, None))
