@@ -84,8 +84,6 @@ KNOWN_MOUNT_RAD, KNOWN_LEVER_M, KNOWN_OFFSET_S = 1e-3, 2e-3, 2e-4
 """Of calibrated values."""
 UNKNOWN_MOUNT_RAD, UNKNOWN_LEVER_M, UNKNOWN_OFFSET_S = 0.1, 0.1, 0.02
 """Of values that the model leaves out, once rotations have been compared: a camera and an IMU on one small drone."""
-SUBMAP_SCALE_LOG = 0.3
-"""Of the scale of a submap on predicted depths relative to the map before it: the network sees another scene."""
 
 # --- clocks -----------------------------------------------------------------------------------------------------------
 
@@ -96,6 +94,8 @@ DELAY_S = 0.3
 
 # --- vision -----------------------------------------------------------------------------------------------------------
 
+SUBMAP_SCALE_LOG = 0.3
+"""Of the scale of a submap on predicted depths relative to the map before it: the network sees another scene."""
 VISUAL_DRIFT = 0.01
 """Drift of the map from frame to frame, as a share of the distance travelled."""
 VISUAL_DRIFT_TURN = 0.003

@@ -134,7 +134,7 @@ class MotionFusion:
             self._remember_refined(stamp_s, IMU_REACH_S)
             self._fit_imu()
         if self._trust.motion and self.metres.uses_velocity(self._trust):
-            self._filter.see(visual, self.scale(), self.flight.delay.delay)
+            self._filter.see(visual, self.metres.scale(), self.flight.delay.delay)
         else:
             self._filter.clear()
 
@@ -214,8 +214,11 @@ class MotionFusion:
         return self.flight.delay_s
 
     def scale(self) -> ScaleEstimate:
-        """Metres per map unit with sigma and source; unchanged without new measurements."""
-        return self.metres.scale()
+        """Metres per map unit around the newest frame, with sigma and source; unchanged without new measurements."""
+        known = self.metres.scale()
+        if self.submap is None:
+            return known
+        return replace(known, sigma=math.hypot(known.sigma, SUBMAP_SCALE_LOG * known.value))
 
     @property
     def filtering(self) -> bool:
@@ -261,8 +264,6 @@ class MotionFusion:
     def health(self, stamp_s: float, state: str, metric: bool) -> Health:
         """Reliability of the scale; arguments as in `present`, and whether the published unit is a metre."""
         sources, delay, scale = self.metres.sources(), self.flight.delay.delay, self.scale()
-        if self.submap is not None:
-            scale = replace(scale, sigma=math.hypot(scale.sigma, SUBMAP_SCALE_LOG * scale.value))
         doubt = self.metres.contradiction()
         return Health(
             stamp_s,

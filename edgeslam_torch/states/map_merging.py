@@ -53,6 +53,7 @@ class MapMerging:
         if self.atlas.is_divided:
             self.atlas.search_all_again()
         self.update()
+        self.system.fusion.submap = None  # the result is the largest whole
 
     def _scale_submap(self, known: SubmapScale) -> None:
         """Bring a submap to the map's unit, about the place where it began, once sensors have measured its own."""

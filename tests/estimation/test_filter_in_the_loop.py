@@ -145,12 +145,13 @@ def test_a_new_piece_of_map_has_a_scale_of_its_own(flown, size):
     before = flown.fusion.scale()
     flown.fusion.begin_piece(*predicted_at(flown, 15.1))
     uncertain = flown.fusion.health(15.1, "tracking", True).scale
+    assert uncertain == flown.fusion.scale()
     assert uncertain.sigma > 0.2 * uncertain.value and not flown.fusion.submap.is_known
     flown.fly_on(20.0, size=size)
     assert flown.fusion.submap.is_known
     assert flown.fusion.submap.growth == pytest.approx(1.0 / size, rel=0.05)
-    assert flown.fusion.scale() == before
     flown.fusion.submap = None
+    assert flown.fusion.scale() == before
     assert flown.fusion.health(20.0, "tracking", True).scale == before
 
 
