@@ -46,6 +46,8 @@ class Vertical:
     """``(3,)`` the same in the world."""
     sigma_rad: float
     """Standard deviation per axis of a single attitude."""
+    held: bool = False
+    """Whether the frame rests on guesses whatever the image shows: the map is new and has no metric scale."""
     mount_rad: float = 0.0
     """The same by the camera's mount: its error turns with the drone, and no other frame reduces it."""
 
@@ -65,7 +67,7 @@ def vertical_since(model: TelemetryModel | None, reference: Keyframe, stamp_s: f
         return None
     turned = float(np.diff(model.track.yaw(stamps_s - model.delay_s))[0])
     mount_rad = 2.0 * abs(math.sin(0.5 * turned)) * model.mount_sigma_rad
-    return Vertical(up.up_c[1], reference.T_w_c[:3, :3] @ up.up_c[0], up.sigma_rad, mount_rad)
+    return Vertical(up.up_c[1], reference.T_w_c[:3, :3] @ up.up_c[0], up.sigma_rad, model.holds_level, mount_rad)
 
 
 def motion_factors(

@@ -7,11 +7,15 @@ import numpy as np
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.rotations import smallest_rotation
 from edgeslam_torch.map.anchors import Anchors
-from edgeslam_torch.mapping.motion_terms import ATTITUDE, EFFECTIVE_SAMPLES, GUESSED, Vertical
+from edgeslam_torch.mapping.motion_terms import ATTITUDE, EFFECTIVE_SAMPLES, Vertical
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
 from edgeslam_torch.optim.pose_only import PoseConfig, PoseResult, refine_pose
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray, IntArray
+
+_NO_IMAGE = 10000.0
+"""Number of reprojections of one image that count as one where it does not measure tilt: more than it has. Errors of
+predicted depths are common to the image and the same in the next one (docs/decisions/05-first-frame.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,14 +30,14 @@ class ExpectedPose:
     """By the drone's attitude."""
 
     def prior(self, on_predicted_depths: bool) -> PosePrior:
-        """The prior with the weight of attitude in windows, see `mapping.motion_terms`.
+        """The prior; where images measure tilt, attitude has its weight of windows (`mapping.motion_terms`).
 
         Images of few and distant points, or of one plane, hardly distinguish a climb from a pitch, so that attitude
         counts in every frame. On predicted depths, whose errors are common to the whole image, the motion counts, too.
         """
         information = self.motion.copy() if on_predicted_depths else np.zeros((6, 6))
         if self.vertical is not None:
-            samples = GUESSED if on_predicted_depths else ATTITUDE * EFFECTIVE_SAMPLES
+            samples = _NO_IMAGE if on_predicted_depths or self.vertical.held else ATTITUDE * EFFECTIVE_SAMPLES
             up_c = self.vertical.up_c
             across = np.eye(3) - np.outer(up_c, up_c)
             information[3:, 3:] += across / self.vertical.sigma(samples) ** 2
