@@ -63,20 +63,6 @@ def test_persistent_outliers_reset_the_bias(rng):
     assert np.exp(usual.line(1.0).offset) == pytest.approx(2.4, rel=0.04)
 
 
-def test_a_second_of_outliers_puts_the_scale_in_doubt(rng):
-    usual = knows(rng)
-    for _ in range(4):
-        usual.is_consistent(fit(rng, 0.8 * 3.0), 1.0, sure=True)
-        assert usual.doubt == 0.0, "a picture or two are chance"
-    usual.is_consistent(fit(rng, 0.8 * 3.0), 1.0, sure=True)
-    assert usual.doubt == pytest.approx(2.0, rel=0.2)
-    assert usual.is_consistent(fit(rng, 0.8), 1.0, sure=True)
-    assert usual.doubt == 0.0
-    for _ in range(5):
-        usual.is_consistent(fit(rng, 0.8 / 4.0), 1.0, sure=True)
-    assert usual.doubt == pytest.approx(0.75, rel=0.1), "too short as well as too long"
-
-
 def test_an_inlier_resets_the_outlier_count(rng):
     usual = knows(rng)
     for _ in range(3):

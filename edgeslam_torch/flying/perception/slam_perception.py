@@ -149,7 +149,7 @@ class SlamPerception:
             )
         health = output.health
         T_w_b = home.poses(pose.T_w_c) @ se3.inverse(self._T_b_c)
-        relative = float(np.hypot(health.scale.sigma / health.scale.value, self._bias.doubt))
+        relative = float(health.scale.sigma / health.scale.value)
         sigma = home.scale * float(np.sqrt(np.clip(np.trace(pose.covariance[:3, :3]) / 3.0, 0.0, None)))
         return DroneState(
             now_s,

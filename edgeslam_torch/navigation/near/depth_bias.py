@@ -1,7 +1,7 @@
 """Bias of a depth network, estimated over many frames of a flight.
 
 Outside its training domain a network is biased by tens of percent, but consistently within a flight. The estimate
-scales frames without map points, and detects a wrong map scale, such as after a turn on the spot.
+scales frames without map points, and those whose points are at a wrong scale, such as after a turn on the spot.
 """
 
 from collections import deque
@@ -18,8 +18,6 @@ _SPREAD = 0.15
 _WIDE_LOG = 0.35
 """Minimum standard deviation of log depth among points to estimate a slope: depths of 1 to 3 m."""
 _SIGMAS = 3.0
-_DOUBTED = 5
-"""Consecutive outlier frames, one second, after which the map's scale is in doubt."""
 
 
 @dataclass(slots=True)
@@ -32,13 +30,6 @@ class DepthBias:
     """Slopes of frames with a wide depth range."""
     _outliers: int = 0
     """Consecutive outlier frames."""
-    _off_log: float = 0.0
-    """Log deviation of the last outlier."""
-
-    @property
-    def doubt(self) -> float:
-        """Relative scale error indicated by consecutive outliers; 0 while frames agree with the bias."""
-        return abs(float(np.expm1(self._off_log))) if self._outliers >= _DOUBTED else 0.0
 
     def is_consistent(self, fit: NearFit, unit_m: float, sure: bool) -> bool:
         """Whether a frame's fit agrees with the bias; added to the estimate if the scale is certain.
@@ -51,7 +42,7 @@ class DepthBias:
         middle_log, ratio_log = float(np.median(fit.network_log)), fit.ratio_log + float(np.log(unit_m))
         off_log = ratio_log - self._expected(middle_log) if self._is_ready() else 0.0
         if abs(off_log) > _SIGMAS * _SPREAD:
-            self._outliers, self._off_log = self._outliers + 1, off_log
+            self._outliers += 1
             if self._outliers > _KEPT // 2:  # the bias itself was estimated at another scale
                 self._ratios.clear()
                 self._outliers = 0
