@@ -22,7 +22,7 @@ ATTITUDE = 0.25
 EFFECTIVE_SAMPLES_AT_THE_END = 1.0
 """The same in the last refinement: drift was corrected in flight, and telemetry errors, correlated over seconds, would
 deform the map."""
-GUESSED = 3000.0
+GUESSED = 300.0
 """The same for gravity before the metric scale is known: predicted depths, whose errors are correlated over the whole
 image, distinguish rotation from translation (docs/decisions/05-first-frame.md)."""
 

@@ -13,7 +13,7 @@ from edgeslam_torch.optim.pose_only import PoseConfig, PoseResult, refine_pose
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray, IntArray
 
-_NO_IMAGE = 10000.0
+_NO_IMAGE = 3000.0
 """Number of reprojections of one image that count as one where it does not measure tilt: more than it has. Errors of
 predicted depths are common to the image and the same in the next one (docs/decisions/05-first-frame.md)."""
 

@@ -130,7 +130,7 @@ def test_attitude_tells_a_climb_from_a_pitch_before_a_distant_wall(rng):
 def test_predicted_depths_that_are_upside_down_do_not_turn_a_climb_into_sinking(rng, held):
     """A wall that leans away is predicted to lean towards the camera: the images alone see a climb as sinking."""
     rays = np.column_stack([rng.uniform([-0.6, -0.4], [0.6, 0.4], (300, 2)), np.ones(300)])
-    host_w, lean = se3.inverse(LEVEL), np.exp(1.5 * rays[:, 1:2])
+    host_w, lean = se3.inverse(LEVEL), np.exp(0.75 * rays[:, 1:2])
     anchors = Anchors()
     words, colour = np.zeros((300, 4), np.uint64), np.zeros((300, 3), np.uint8)
     ids = anchors.add(se3.transform(host_w, 3.0 * rays / lean), words, 0, True, colour)
@@ -144,5 +144,5 @@ def test_predicted_depths_that_are_upside_down_do_not_turn_a_climb_into_sinking(
         pose_on_anchors(anchors, ids, uv, np.ones(300), LEVEL, CAMERA, expected, PoseConfig()).T_c_w
         for expected in (None, expected_pose(LEVEL, np.zeros((6, 6)), vertical))
     )
-    assert se3.inverse(alone)[2, 3] < -0.02 and tilt_deg(alone) > 1.0
-    assert se3.inverse(level)[2, 3] > 0.02 and tilt_deg(level) < 0.5
+    assert se3.inverse(alone)[2, 3] < -0.02 and tilt_deg(alone) > 1.4
+    assert se3.inverse(level)[2, 3] > 0.0 and tilt_deg(level) < 1.1
