@@ -7,15 +7,11 @@ import numpy as np
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.rotations import smallest_rotation
 from edgeslam_torch.map.anchors import Anchors
-from edgeslam_torch.mapping.motion_terms import ATTITUDE, EFFECTIVE_SAMPLES, Vertical
+from edgeslam_torch.mapping.motion_terms import ATTITUDE, EFFECTIVE_SAMPLES, GUESSED_IMAGE, Vertical
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
 from edgeslam_torch.optim.pose_only import PoseConfig, PoseResult, refine_pose
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray, IntArray
-
-_NO_IMAGE = 3000.0
-"""Number of reprojections of one image that count as one where it does not measure tilt: more than it has. Errors of
-predicted depths are common to the image and the same in the next one (docs/decisions/05-first-frame.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +33,7 @@ class ExpectedPose:
         """
         information = self.motion.copy() if on_predicted_depths else np.zeros((6, 6))
         if self.vertical is not None:
-            samples = _NO_IMAGE if on_predicted_depths or self.vertical.held else ATTITUDE * EFFECTIVE_SAMPLES
+            samples = GUESSED_IMAGE if on_predicted_depths or self.vertical.held else ATTITUDE * EFFECTIVE_SAMPLES
             up_c = self.vertical.up_c
             across = np.eye(3) - np.outer(up_c, up_c)
             information[3:, 3:] += across / self.vertical.sigma(samples) ** 2
