@@ -26,8 +26,8 @@ GUESSED = 300.0
 """The same for gravity before the metric scale is known: predicted depths, whose errors are correlated over the whole
 image, distinguish rotation from translation (docs/decisions/05-first-frame.md)."""
 GUESSED_IMAGE = 3000.0
-"""The same for a single image: more than it has, since it does not measure tilt. A window of several views does, and this
-weight would bend it where the attitude is wrong."""
+"""The same for a single image: more than it has, since it does not measure tilt. A window of several views does, and
+this weight would bend it where the attitude is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
