@@ -16,7 +16,7 @@ from edgeslam_torch.navigation.map_views import MapViews, Places
 from edgeslam_torch.navigation.openings.exit_tracker import PLACES_M, ExitTracker
 from edgeslam_torch.navigation.openings.wall_frame import Walls
 from edgeslam_torch.navigation.route import TIGHT_M, CostToGo, cost_to_go
-from edgeslam_torch.navigation.skills.skill import NO_WAY, ROUND_S, Result, Skill
+from edgeslam_torch.navigation.skills.skill import ROUND_S, Result, Skill
 from edgeslam_torch.navigation.space import CELL_M, Space
 from edgeslam_torch.navigation.speed_dither import dithered
 from edgeslam_torch.navigation.supervisor import DEAD_RECKONING_SIGMA_M
@@ -235,7 +235,7 @@ class Pilot:
     def _start_over(self, state: DroneState) -> None:
         """Observe obstacles anew, once per place: they may stem from a wrong depth or pose."""
         if self._started_over or not state.tracked:
-            self.result = NO_WAY
+            self.result = self.skill.no_way()
             return
         self.space.doubt_solids()
         self._views.start_over()

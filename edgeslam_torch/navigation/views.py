@@ -247,17 +247,11 @@ class ViewPlanner:
             self.look = replace(self.look, stands_s=_OPENING_S)
         return self._goes_on
 
-    def viewpoints(self, layer: Layer, state: DroneState, among: np.ndarray | None = None) -> np.ndarray:
-        """Cells ``(G, 2)`` to look around from, greedily by the width of targets that each adds.
-
-        Args:
-            layer: Current layer.
-            state: Current state.
-            among: Cells ``(M, 2)`` that may be viewpoints; all free ones when None.
-        """
+    def viewpoints(self, layer: Layer, state: DroneState) -> np.ndarray:
+        """Cells ``(G, 2)`` to look around from, greedily by the width of targets that each adds."""
         here = state.p_w[:2]
         self._left = self._coverage.unlooked(borders(layer, here))
-        cells = np.argwhere(layer.free & (layer.from_solid_m > _PASSED_M)) if among is None else among
+        cells = np.argwhere(layer.free & (layer.from_solid_m > _PASSED_M))
         passable = layer.part_around(layer.from_solid_m > _PASSED_M - 0.5 * layer.cell_m, here)
         cells = cells[passable[tuple(cells.T)] & (cells % _COARSE == 0).all(axis=1)]
         p_w, width_m = layer.centres(cells).reshape(-1, 2), self._targets().width_m

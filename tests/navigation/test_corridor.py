@@ -180,14 +180,34 @@ def test_at_an_apparent_end_unknown_sides_are_viewed_and_then_it_ends():
         if (wanted := views.taking(here)) is not None:
             turn = np.clip(here.turn_to_rad(wanted.heading_rad), -0.1, 0.1)
             here = replace(here, yaw_rad=here.yaw_rad + float(turn))
-            headings.append(here.yaw_rad)
+            headings.append(math.sin(here.yaw_rad))
         elif not task.looks(here, views) and len(cells := goals(task, layer, here, views)):
             found = layer.centres(cells)
             assert np.linalg.norm(found - [2.4, 0.0], axis=1).max() < 3.0, "near the end only"
             here = replace(here, p_w=np.array([*found[np.abs(found[:, 0] - here.p_w[0]).argmin()], 1.15]))
     assert task.result(here).reached and task.result(here).reason == "the corridor ends"
     assert abs(here.p_w[0] - 2.4) < 0.4
-    assert max(headings) > 1.2, "the left side is unknown"
+    assert max(headings) > 0.95 and min(headings) < -0.95, "depth may have closed a mouth on either side"
+
+
+def test_a_mouth_that_depth_closed_is_seen_from_before_it():
+    """Passing it at a grazing angle put a wall across it; a view of it from before it takes the wall away."""
+    wall = lambda x, y: (np.abs(y - 1.1) < 0.15) & (np.abs(x) < 1.2)  # noqa: E731
+    closed, open_ = seen(lambda x, y: stub(x, y) | wall(x, y)), seen(stub)
+    task, views, layer, here = FollowCorridor(), ViewPlanner(0.15), closed, state(2.4, stamp_s=10.0)
+    at_the_end(task, layer)
+    while here.stamp_s < 200.0 and not task.result(here):
+        here = replace(here, stamp_s=here.stamp_s + 0.1)
+        if (wanted := views.taking(here)) is not None:
+            here = replace(here, yaw_rad=wanted.heading_rad)
+            if abs(here.p_w[0]) < 0.35 and math.sin(here.yaw_rad) > 0.9:
+                layer = open_
+        elif not task.looks(here, views):
+            to = layer.centres(goals(task, layer, here, views)[0])
+            if to[1] > 1.6:
+                return
+            here = replace(here, p_w=np.array([*to, 1.15]))
+    pytest.fail("the side corridor was not entered")
 
 
 def test_a_side_corridor_that_a_view_shows_is_followed():
@@ -218,7 +238,7 @@ def test_a_corridor_ends_in_a_room():
 def test_the_goal_is_in_the_middle_of_the_far_end():
     """Whatever is unseen beside the way, and however aslant it flies."""
     layer = seen(sides(), lambda x, y: np.abs(y - 0.9) < 0.2)
-    assert place(FollowCorridor(), layer, state(0.0, yaw=0.35)) == pytest.approx([4.4, 0.0], abs=0.2)
+    assert place(FollowCorridor(), layer, state(0.0, yaw=0.35)) == pytest.approx([4.4, 0.0], abs=0.3)
 
 
 def test_a_narrowed_end_is_viewed_before_it_ends():

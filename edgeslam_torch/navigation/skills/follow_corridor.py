@@ -13,10 +13,10 @@ from edgeslam_torch.navigation.openings.exit_tracker import SAME_COS, Exit
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
 from edgeslam_torch.navigation.openings.wall_frame import Walls, wall_directions
 from edgeslam_torch.navigation.skills.skill import FEW_LOSSES, Result, Skill, since_s
-from edgeslam_torch.navigation.views import ViewPlanner
+from edgeslam_torch.navigation.views import Look, ViewPlanner
 from edgeslam_torch.types import FloatArray
 
-_BERTH_M, _NARROW_M = 0.55, 0.3
+_BERTH_M, _NARROW_M = 0.45, 0.3
 """Clearance of the space that is followed: a corridor is wider than twice this, a doorway is not; and straight ahead,
 where underestimated depth may narrow the corridor to a door's width."""
 _ARRIVED_M = 0.6
@@ -30,11 +30,14 @@ _ALONG_WALLS_COS = math.cos(math.radians(25.0))
 _DEAD_END_M = 1.5
 """Radius of a dead end, and distance of the goal ahead in unknown space."""
 _WALL_M = 2.0
-"""Distance at which a wall ahead ends a corridor, and within which its sides are viewed: a corridor that turns off
-there was seen at a grazing angle in passing."""
+"""Distance at which a wall ahead ends a corridor."""
+_SWEEP_M = (1.0, 2.5)
+"""Distances before an apparent end from which its sides are viewed: a corridor that turns off there was seen at a
+grazing angle in passing, and depth may have closed its mouth."""
 _AT_END_M = 0.4
 _TURN_COST_M = 6.0
 """Cost of a turn by 180 degrees: corridors ahead are preferred to those that turn back."""
+ENDS = Result(True, "the corridor ends")
 _HOLDS_S = 2.0
 """Time for which a room, or an end without a view that is left, must hold: views arrive half a second late, and two
 free a cell."""
@@ -55,7 +58,13 @@ class FollowCorridor(Skill):
     _end: Places = field(default_factory=Places)
     """Apparent end of the corridor, if it appears to end now."""
     _viewed_s: float = math.nan
-    """Since when no view of the apparent end is left, and the drone is back there."""
+    """Since when no view of the apparent end's sides is left, and the drone is back there."""
+    _sweep: Places = field(default_factory=Places)
+    """Places from which to view them, the next one first."""
+    _swept: Places = field(default_factory=Places)
+    """Places from which sides were viewed."""
+    _sides_rad: list[float] = field(default_factory=list)
+    """Bearings of the sides to view from here."""
     _wide_s: float = math.nan
     """Since when it is in a room."""
     _doors: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
@@ -67,24 +76,30 @@ class FollowCorridor(Skill):
 
     def goals(self, layer: Layer, state: DroneState, views: ViewPlanner) -> np.ndarray:
         """Goal cells ``(G, 2)``: wide space ahead, else a corridor that turns off, else narrow or unknown space
-        straight ahead, else viewpoints of the sides before the end."""
+        straight ahead, else where to view the sides before the end, else the end."""
         here = state.p_w[:2]
         self._fly(state)
         room = len(self._trail) > 1 and 2.0 * float(layer.clearance_at(here[None])[0]) > WIDEST_M
         self._wide_s = since_s(room, self._wide_s, state)
-        found = self._onward(layer, state)
+        axis = self._direction(layer, here)
+        found = self._onward(layer, state, axis)
         if len(found):
-            self._viewed_s = math.nan
+            self._viewed_s, self._sides_rad = math.nan, []
             return found
-        cells = _wide(layer, here, _BERTH_M)
-        cells = cells[self._end.away_m(layer.centres(cells).reshape(-1, 2)) < _WALL_M]
-        spots, at_end = views.viewpoints(layer, state, cells), self._end.is_near(here, _AT_END_M)
-        self._viewed_s = since_s(at_end and not len(spots), self._viewed_s, state)
-        return spots if len(spots) or at_end else layer.cells(self._end.p_w)
+        if self._sweep.is_near(here, _AT_END_M):
+            ahead = math.atan2(axis[1], axis[0])
+            self._sides_rad = [ahead + 0.5 * math.pi, ahead - 0.5 * math.pi]
+            self._swept.add(state.views, here)
+        self._sweep.keep(self._swept.away_m(self._sweep.p_w) > _STEP_M)
+        self._viewed_s = since_s(not len(self._sweep) and self._end.is_near(here, _AT_END_M), self._viewed_s, state)
+        return layer.cells(self._sweep.p_w[:1] if len(self._sweep) else self._end.p_w)
 
     def looks(self, state: DroneState, views: ViewPlanner) -> bool:
-        """To the sides at an apparent end."""
-        return len(self._end) > 0 and views.look_around(state)
+        """To the sides before an apparent end."""
+        if not self._sides_rad or not state.tracked:
+            return False
+        views.take(Look(self._sides_rad.pop()), state)
+        return True
 
     def result(self, state: DroneState, losses: int = 0) -> Result | None:
         """The corridor ended, or the drone has not flown a metre of one."""
@@ -95,7 +110,11 @@ class FollowCorridor(Skill):
             return Result(False, "there is no corridor here")
         if room:
             return Result(True, "the corridor opens into a room")
-        return Result(True, "the corridor ends") if ends else result
+        return ENDS if ends else result
+
+    def no_way(self) -> Result:
+        """An apparent end is one also if the way back from it is not seen."""
+        return ENDS if len(self._end) and len(self._trail) > 1 else super(FollowCorridor, self).no_way()
 
     def _fly(self, state: DroneState) -> None:
         """Add the position to the trail if it is a metre from all others; backing up adds none."""
@@ -121,10 +140,9 @@ class FollowCorridor(Skill):
             return self._heading_w
         return np.asarray(along[best] * np.sign(cosines[best]))
 
-    def _onward(self, layer: Layer, state: DroneState) -> np.ndarray:
+    def _onward(self, layer: Layer, state: DroneState, axis: FloatArray) -> np.ndarray:
         """Where the corridor leads on ``(G, 2)``; sets or resets its end."""
         here = state.p_w[:2]
-        axis = self._direction(layer, here)
         cells = _wide(layer, here, _BERTH_M)
         p_w = layer.centres(cells).reshape(-1, 2)
         along = (p_w - here) @ axis
@@ -149,7 +167,9 @@ class FollowCorridor(Skill):
             return _far_middle(layer, cells[straight], axis)
         if not len(self._end) and not _is_walled(layer, here, axis):
             return layer.cells(here + _DEAD_END_M * axis)[None]
-        self._end = self._end if len(self._end) else Places(state.views, here)
+        if not len(self._end):
+            self._end = Places(state.views, here)
+            self._sweep = Places(state.views, here - np.array(_SWEEP_M)[:, None] * axis)
         return cells[:0]
 
     def _leads_on(self, p_w: FloatArray) -> np.ndarray:

@@ -51,6 +51,10 @@ class Skill:
             return TIME_OVER
         return LOST_REPEATEDLY if losses >= MOST_LOSSES else None
 
+    def no_way(self) -> Result:
+        """The result if the planner finds no way to the goals."""
+        return NO_WAY
+
     def consider(self, exits: Sequence[Exit]) -> None:
         """Receive the exits known so far."""
 
