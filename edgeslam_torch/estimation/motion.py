@@ -35,7 +35,7 @@ from edgeslam_torch.estimation.telemetry.visual_memory import VisualMemory, Visu
 from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
 from edgeslam_torch.geometry.level import Up
 from edgeslam_torch.imu import ImuModel, ImuReadings
-from edgeslam_torch.noise import MOUNT_RAD, SUBMAP_SCALE_LOG
+from edgeslam_torch.noise import MOUNT_RAD
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
 
 _REFIT_S = 1.0
@@ -80,7 +80,8 @@ class MotionFusion:
         self._comparison = Comparison(self.flight)
         self._filter = FilterFeed(config, given)
         self.submap: SubmapScale | None = None
-        """Scale of a submap that began on predicted depths; None once it is that of the map. `MapMerging` resets it."""
+        """Scale of a submap that began on predicted depths; None once it is joined to another, or as well known as the
+        map's. `MapMerging` resets it."""
         self._begun: VisualPose | None = None
         """Newest pose of the submap that began last, before its first tracked frame."""
         self._fitted_s = -math.inf
@@ -190,8 +191,7 @@ class MotionFusion:
     def begin_piece(self, stamp_s: float, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
         """Begin a submap at a predicted pose: the step between submaps is no motion of the camera.
 
-        The submap has a scale of its own, by predicted depths, until sensors have measured it. Arguments as for
-        `add_visual`.
+        The submap has a scale of its own, by predicted depths, which sensors measure. Arguments as for `add_visual`.
         """
         self._begun = VisualPose(stamp_s, T_w_c, sigma_t, sigma_r_rad)
         before = self.metres.sensor_scale if self.submap is None else self.submap.before
@@ -218,7 +218,8 @@ class MotionFusion:
         known = self.metres.scale()
         if self.submap is None:
             return known
-        return replace(known, sigma=math.hypot(known.sigma, SUBMAP_SCALE_LOG * known.value))
+        own = self.submap.sigma
+        return replace(known, sigma=math.hypot(known.sigma, own * known.value))
 
     @property
     def filtering(self) -> bool:
@@ -358,7 +359,8 @@ class MotionFusion:
     def _is_due(self, stamp_s: float) -> bool:
         known = self.metres.sensor_scale is not None and math.isfinite(self.flight.delay_sigma_s)
         first_s = _REFIT_S if known else _FIRST_FIT_S
-        grown_s = 0.0 if self.submap is not None else _REFIT_SHARE * min(self._memory.length_s, WINDOW_S)
+        began = self.submap is not None and not self.submap.is_known
+        grown_s = 0.0 if began else _REFIT_SHARE * min(self._memory.length_s, WINDOW_S)
         pause_s = max(first_s, grown_s)
         return len(self._track) > 0 and (self.orientation.found is None or stamp_s - self._fitted_s >= pause_s)
 
@@ -377,11 +379,12 @@ class MotionFusion:
         orientation.found = turned
         T_b_c, rough = orientation.T_b_c, metres.rough()
         self._comparison.judge(T_b_c, turned.R_w_m, rough, flying)
-        if self.submap is not None and flying:  # what it measures says nothing of the map before it
+        if self.submap is not None:  # what it measures says nothing of the map before it
             own = replace(self.flight, memory=self._memory.since(self.submap.since_s), trust=deepcopy(self._trust))
             if len(own.memory.sightings().stamps_s) > 0:
                 found, _ = TelemetryScale(own, T_b_c, turned, rough, None, None, flying).beliefs()
-                self.submap = replace(self.submap, measured=mean(list((found or {}).values())))
+                if found is not None:
+                    self.submap = replace(self.submap, measured=mean(list(found.values())))
             return
         scale = TelemetryScale(self.flight, T_b_c, turned, rough, metres.network(), metres.previous_scale(), flying)
         metres.take(*scale.beliefs(), self._trust)

@@ -56,7 +56,8 @@ class MapMerging:
         self.system.fusion.submap = None  # the result is the largest whole
 
     def _scale_submap(self, known: SubmapScale) -> None:
-        """Bring a submap to the map's unit, about the place where it began, once sensors have measured its own."""
+        """Bring a submap to the map's unit, about the place where it began, whenever sensors contradict that it is: a
+        change of the unit instead would move that place, where the map before it had the camera."""
         system, graph = self.system, self.atlas.graph
         last = system.log.records[-1].keyframe_id
         piece = system.map.piece_of(last)
@@ -64,14 +65,14 @@ class MapMerging:
         if start is None or start.keyframe_id != max(s.keyframe_id for s in graph.starts.values()):
             system.fusion.submap = None  # back in the map before it
             return
-        if not known.is_known:
-            return
-        system.fusion.submap = None
-        if known.growth == 1.0:
+        growth = known.growth
+        if known.is_settled:
+            system.fusion.submap = None
+        if growth == 1.0:
             return
         T_c_k = system.motion.T_c_w @ se3.inverse(system.map.pose_of(last))
         began = se3.inverse(system.map.pose_of(start.keyframe_id))[:3, 3]
-        S = sim3.compose(known.growth, np.eye(3), (1.0 - known.growth) * began)
+        S = sim3.compose(growth, np.eye(3), (1.0 - growth) * began)
         members = [id for id in system.map.keyframes if system.map.piece_of(id) == piece]
         self._follow(last, T_c_k, move(system.map, self.atlas.edges, system.log, dict.fromkeys(members, S))[last])
         system.events["scaled"] = system.events.get("scaled", 0) + 1

@@ -190,12 +190,18 @@ def test_a_submap_is_brought_to_the_maps_unit_about_its_beginning(rng, monkeypat
     assert set(S) == {5, KEYFRAME}, "of this submap alone"
     np.testing.assert_allclose(sim3.transform(S[5], began[None])[0], began, atol=1e-12)
     np.testing.assert_allclose(after, 0.5 * before, atol=1e-9)
-    assert system.fusion.submap is None and system.published.revision == 1 and system.events == {"scaled": 1}
+    assert system.published.revision == 1 and system.events == {"scaled": 1}
+    assert system.fusion.submap is not None, "its unit is known less well than the map's"
+
+
+def test_a_submap_measured_as_well_as_the_map_is_of_one_unit_with_it(rng, monkeypatch):
+    system, moved, _, _ = scaling(rng, monkeypatch, 1, measured=0.99, sigma=0.02)
+    assert len(moved) == 1 and system.fusion.submap is None
 
 
 @pytest.mark.parametrize(
     ("piece", "measured", "sigma", "settled"),
-    [(1, 0.97, 0.03, True), (1, 0.5, 0.2, False), (0, 0.5, 0.03, True)],
+    [(1, 0.97, 0.03, False), (1, 0.5, 0.2, False), (0, 0.5, 0.03, True)],
     ids=["of the map's unit", "not yet known", "back in the first submap"],
 )
 def test_other_submaps_stay(rng, monkeypatch, piece, measured, sigma, settled):

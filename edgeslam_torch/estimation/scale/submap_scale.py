@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 from edgeslam_torch.estimation.scale.belief import ScaleBelief, contradict
+from edgeslam_torch.noise import SUBMAP_SCALE_LOG
 
 _SURE = 0.1
 """Relative sigma from which on the submap's scale counts as measured."""
@@ -26,8 +27,18 @@ class SubmapScale:
         return self.measured is not None and self.measured.sigma < _SURE
 
     @property
+    def is_settled(self) -> bool:
+        """Whether it is measured as accurately as the map's: then both are one."""
+        return self.measured is not None and self.measured.sigma <= self.before.sigma
+
+    @property
+    def sigma(self) -> float:
+        """Relative standard deviation of the submap's unit in the map's."""
+        return self.measured.sigma if self.measured is not None and self.is_known else SUBMAP_SCALE_LOG
+
+    @property
     def growth(self) -> float:
-        """Factor by which the submap has to grow to be in the map's unit; 1 unless both contradict each other.
+        """Factor by which the submap has to grow to be in the map's unit; 1 while both may be the same.
 
         Example:
             >>> before = ScaleBelief(0.0, 0.02, "telemetry")
@@ -36,6 +47,8 @@ class SubmapScale:
             >>> SubmapScale(0.0, before, ScaleBelief(math.log(0.95), 0.05, "height")).growth
             1.0
         """
-        if self.measured is None or not self.is_known or not contradict(self.measured, self.before):
+        if self.measured is None or not self.is_known:
+            return 1.0
+        if not (self.is_settled or contradict(self.measured, self.before)):
             return 1.0
         return math.exp(self.measured.log_scale - self.before.log_scale)
