@@ -241,7 +241,9 @@ class MotionFusion:
         return None
 
     def republished(self, published: OutputFrame) -> OutputFrame:
-        """The published frame, levelled and with the present scale."""
+        """The published frame, levelled and with the present scale; as it is where a submap has a scale of its own."""
+        if self.submap is not None:
+            return published
         upright, by_imu = self.orientation.upright(), self.imu.upright()
         validated = self._trust.turns if upright is not None else by_imu is not None
         return published.turned_upright(by_imu if upright is None else upright, validated).revised(self.scale())

@@ -127,6 +127,7 @@ class Starting:
         if frame.stamp_s - lost_since_s >= LOST_BEFORE_RESTART_S and seen >= enough and not waiting:
             system.events["restarted"] += 1
             system.motion.stop()
+            system.level(frame.stamp_s)
             return self.begin(frame, view, AFTER_LOSS)
         reason = f"only {seen} keypoints" if seen < MIN_KEYPOINTS else "too few keypoints agree with the map"
         return Step(Event.NOTHING, system.map.latest(), FrameStatus.PREDICTED, UNCONFIRMED if waiting else reason)

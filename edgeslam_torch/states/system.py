@@ -14,6 +14,7 @@ from edgeslam_torch.estimation.output_frame import OutputFrame, first_pose
 from edgeslam_torch.estimation.scale.depth_scale import DepthRatio, compared
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.rotations import smallest_rotation
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
@@ -146,6 +147,16 @@ class System:
         with self.timed("fusion"):
             self.fusion.add_earlier(stamps_s, T_w_c, *_sigmas(track))
             self.published = self.fusion.republished(self.published)
+
+    def level(self, stamp_s: float) -> None:
+        """Turn the present, predicted pose about its centre to where the drone's attitude has the vertical: the tilt of
+        the last poses before a loss would be that of a new submap."""
+        model = self.telemetry("every")
+        up = None if model is None else model.up(np.array([stamp_s]))
+        if up is not None and len(up.frame):
+            T_c_w = self.motion.T_c_w.copy()
+            T_c_w[:3] = smallest_rotation(T_c_w[:3, :3] @ up.up_m, up.up_c[0]) @ T_c_w[:3]
+            self.motion.T_c_w = T_c_w
 
     def begin_submap(self, keyframe: Keyframe) -> None:
         """A submap begins with a keyframe at the present, predicted pose."""

@@ -188,7 +188,8 @@ class ExitTracker:
             gap = next((g for g in gaps if track.is_at(g)), None)
             gaps = [g for g in gaps if g is not gap]
             _update(track, gap, rays, state)
-            if self._looked_w is not None and _leads_through(track, self._looked_w, here):
+            # A body that passed where the map shows no wall any more has passed no opening.
+            if gap is not None and self._looked_w is not None and _leads_through(track, self._looked_w, here):
                 track.odds = math.inf
         for gap in gaps:
             if np.linalg.norm(gap.centre_w - here) < _NEAR_M and not any(track.is_at(gap) for track in self._tracks):
