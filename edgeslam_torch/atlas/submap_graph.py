@@ -156,7 +156,16 @@ class SubmapGraph:
             return None
         drift, steps = self._drift(one, other)
         sigma_t, sigma_r = math.hypot(sigma_t, drift, PLACE * depth), math.hypot(sigma_r, DRIFT_RAD)
-        return Belief(sigma_t, sigma_r, DRIFT_LOG * math.sqrt(steps)) if one_map else Belief(sigma_t, sigma_r)
+        return Belief(sigma_t, sigma_r, DRIFT_LOG * math.sqrt(steps) if one_map else self._relative_log(mine, theirs))
+
+    def _relative_log(self, piece: int, other: int) -> float:
+        """Standard deviation of the log scale of one submap relative to another: sensors measure that in which the
+        flight began, whose unit is the map's, and the newest."""
+        scale = self.scale_now()
+        measured = {self.first, self.map.piece_of(self.log.records[-1].keyframe_id)}
+        if not {piece, other} <= measured or SENSORS.isdisjoint(scale.source.split("+")):
+            return math.inf
+        return math.hypot(math.sqrt(2.0) * scale.sigma / scale.value, PLACE_LOG)
 
     def _drift(self, one: Keyframe, other: Keyframe) -> tuple[float, int]:
         """Standard deviation of the drift per axis along the path between two keyframes with the least of it, over

@@ -147,6 +147,8 @@ def test_a_new_piece_of_map_has_a_scale_of_its_own(flown, size):
     uncertain = flown.fusion.health(15.1, "tracking", True).scale
     assert uncertain == flown.fusion.scale()
     assert uncertain.sigma > 0.2 * uncertain.value and not flown.fusion.submap.is_known
+    leaning = OutputFrame(3.0, se3.exp(np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0]))[:3, :3])
+    assert flown.fusion.republished(leaning) is leaning
     flown.fly_on(20.0, size=size)
     assert flown.fusion.submap.is_known
     assert flown.fusion.submap.growth == pytest.approx(1.0 / size, rel=0.05)

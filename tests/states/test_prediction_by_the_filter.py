@@ -69,3 +69,22 @@ def test_a_correction_of_the_map_is_passed_to_the_fusion():
     after = se3.inverse(keyframes.motion.T_c_w)
     assert np.linalg.norm(after - before) > 0.01
     np.testing.assert_allclose(moved[0] @ before, after, atol=1e-9)
+
+
+def test_a_new_submap_begins_upright_where_the_camera_is(rng):
+    """Poses before a blank wall lean by six degrees; heading and centre are what they were."""
+    keyframes, T_true = system(), se3.exp(np.concatenate([rng.normal(size=3), [0.3, 1.2, -0.1]]))
+    up_m = np.array([0.1, -0.9, 0.3]) / np.linalg.norm([0.1, -0.9, 0.3])
+    up_c = T_true[:3, :3] @ up_m
+    lean = se3.exp(np.concatenate([np.zeros(3), 0.1 * np.cross(up_c, [1.0, 0.0, 0.0])]))
+    keyframes.motion.T_c_w = lean @ T_true
+    before = se3.inverse(keyframes.motion.T_c_w)
+    told = SimpleNamespace(frame=np.zeros(1, int), up_c=up_c[None], up_m=up_m)
+    keyframes.telemetry = lambda *_: SimpleNamespace(up=lambda stamps_s: told)
+    System.level(keyframes, 0.3)
+    after = se3.inverse(keyframes.motion.T_c_w)
+    np.testing.assert_allclose(keyframes.motion.T_c_w[:3, :3] @ up_m, up_c, atol=1e-12)
+    np.testing.assert_allclose(after[:3, 3], before[:3, 3], atol=1e-12)
+    keyframes.telemetry = lambda *_: None
+    System.level(keyframes, 0.4)
+    np.testing.assert_array_equal(se3.inverse(keyframes.motion.T_c_w), after)

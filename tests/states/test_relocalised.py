@@ -9,7 +9,7 @@ import pytest
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.atlas.submap_graph import SubmapGraph
 from edgeslam_torch.estimation.filter.filter_feed import PoseEstimate
-from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.states.tracking import Tracking
 from edgeslam_torch.types import ScaleEstimate
 
@@ -128,6 +128,26 @@ def test_the_gate_includes_the_uncertainty_between_submaps(between, may):
     flown = Flown(between=between)
     flown.piece_of[5] = 1
     assert (flown.finds(3.2) is not None) == may
+
+
+@pytest.mark.parametrize(
+    ("metres", "factor", "may"),
+    [
+        (ScaleEstimate(1.0, 0.03, "telemetry"), 2.2, False),
+        (ScaleEstimate(1.0, 0.03, "telemetry"), 1.1, True),
+        (ScaleEstimate(1.0, 0.3, "telemetry"), 2.2, True),
+        (ScaleEstimate(1.0, 0.03, "depth"), 2.2, True),
+    ],
+)
+def test_a_link_does_not_double_a_submap_whose_unit_sensors_have_measured(metres, factor, may):
+    flown = Flown(between=5.0)
+    flown.piece_of[5] = 1
+    graph = flown.system().graph
+    graph.scale_now = lambda: metres
+    camera = flown.keyframes[5]
+    S = sim3.compose(factor, np.eye(3), (1.0 - factor) * camera.centre_w)
+    belief = graph.between(camera, flown.keyframes[0], 2.0)
+    assert belief.allows(S, se3.inverse(placed(5.0))) == may
 
 
 def test_images_decide_without_related_sensors():
