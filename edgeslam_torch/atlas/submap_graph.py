@@ -152,11 +152,12 @@ class SubmapGraph:
         if not one_map and BEFORE_S in (one.stamp_s, other.stamp_s):
             return None
         sigma_t, sigma_r = self.uncertainty(mine, theirs, one.centre_w)
+        relative_log = self._relative_log(mine, theirs)
         if not math.isfinite(sigma_t):
-            return None
+            return Belief(math.inf, math.inf, relative_log) if math.isfinite(relative_log) else None
         drift, steps = self._drift(one, other)
         sigma_t, sigma_r = math.hypot(sigma_t, drift, PLACE * depth), math.hypot(sigma_r, DRIFT_RAD)
-        return Belief(sigma_t, sigma_r, DRIFT_LOG * math.sqrt(steps) if one_map else self._relative_log(mine, theirs))
+        return Belief(sigma_t, sigma_r, DRIFT_LOG * math.sqrt(steps) if one_map else relative_log)
 
     def _relative_log(self, piece: int, other: int) -> float:
         """Standard deviation of the log scale of one submap relative to another: sensors measure that in which the

@@ -188,8 +188,9 @@ class ExitTracker:
             gap = next((g for g in gaps if track.is_at(g)), None)
             gaps = [g for g in gaps if g is not gap]
             _update(track, gap, rays, state)
-            # A body that passed where the map shows no wall any more has passed no opening.
-            if gap is not None and self._looked_w is not None and _leads_through(track, self._looked_w, here):
+            # A body that passed where no wall was likely, and the map shows none now, has passed no opening.
+            likely = gap is not None or track.odds > _UNDECIDED
+            if likely and self._looked_w is not None and _leads_through(track, self._looked_w, here):
                 track.odds = math.inf
         for gap in gaps:
             if np.linalg.norm(gap.centre_w - here) < _NEAR_M and not any(track.is_at(gap) for track in self._tracks):
