@@ -233,6 +233,12 @@ class MotionFusion:
         view = self._filter.view(stamp_s) if last is not None and stamp_s > last.stamp_s else None
         return None if view is None else view.in_map(self.scale(), self.flight.delay_sigma_s)
 
+    @property
+    def begun(self) -> PoseEstimate | None:
+        """The newest pose in a submap that has no map yet, with the uncertainty of its beginning; None in any other."""
+        begun = self._begun
+        return None if begun is None else PoseEstimate(begun.T, begun.sigma_t, begun.sigma_r_rad)
+
     def up(self) -> Up | None:
         """The vertical in the map, by the IMU or by an attitude that the images do not contradict."""
         for source, found in (("imu", self.imu.up), ("telemetry", self.orientation.up)):

@@ -275,7 +275,7 @@ class Tracking:
         """Whether a relocalised pose agrees with the sensors' prediction: on repetitive walls several frames match
         metres away. Images decide alone without sensors, and where nothing relates both places."""
         system = self.system
-        predicted, records = system.fusion.predict(stamp_s), system.log.records
+        predicted, records = system.fusion.predict(stamp_s) or system.fusion.begun, system.log.records
         if predicted is None or not records:
             return True
         here = system.map.keyframes[system.map.resolve(records[-1].keyframe_id)[0]]

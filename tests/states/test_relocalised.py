@@ -38,6 +38,7 @@ class Flown:
         }
         self.piece_of = dict.fromkeys(range(6), 0)
         self.predicted = PoseEstimate(placed(5.0), sigma, 0.01)
+        self.begun = None
         self.asked = []
         self.sees_again = {}
         """Anchors that the two newest keyframes share with others."""
@@ -66,7 +67,7 @@ class Flown:
             graph=graph,
             tracker=SimpleNamespace(local_keyframes=lambda anchor: [self.keyframes[0]]),
             log=log,
-            fusion=SimpleNamespace(predict=lambda stamp_s: self.predicted),
+            fusion=SimpleNamespace(predict=lambda stamp_s: self.predicted, begun=self.begun),
         )
 
     def finds(self, x, turned_deg=0.0):
@@ -150,6 +151,14 @@ def test_a_link_does_not_double_a_submap_whose_unit_sensors_have_measured(betwee
     S = sim3.compose(factor, np.eye(3), (1.0 - factor) * camera.centre_w)
     belief = graph.between(camera, flown.keyframes[0], 2.0)
     assert (belief is None or belief.allows(S, se3.inverse(placed(5.0)))) == may
+
+
+@pytest.mark.parametrize(("between", "may"), [(0.1, False), (np.inf, True)])
+def test_a_submap_that_has_no_map_yet_is_where_it_began(between, may):
+    flown = Flown(between=between)
+    flown.piece_of[5] = 1
+    flown.predicted, flown.begun = None, flown.predicted
+    assert (flown.finds(3.2) is not None) == may
 
 
 def test_images_decide_without_related_sensors():
