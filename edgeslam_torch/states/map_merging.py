@@ -66,8 +66,8 @@ class MapMerging:
             system.fusion.submap = None  # back in the map before it
             return
         growth = known.growth
-        if known.is_settled:
-            system.fusion.submap = None
+        # Growth counts once, also if the sensors cannot measure the grown submap again.
+        system.fusion.submap = None if known.is_settled else known.grown()
         if growth == 1.0:
             return
         T_c_k = system.motion.T_c_w @ se3.inverse(system.map.pose_of(last))

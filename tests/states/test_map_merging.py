@@ -192,6 +192,7 @@ def test_a_submap_is_brought_to_the_maps_unit_about_its_beginning(rng, monkeypat
     np.testing.assert_allclose(after, 0.5 * before, atol=1e-9)
     assert system.published.revision == 1 and system.events == {"scaled": 1}
     assert system.fusion.submap is not None, "its unit is known less well than the map's"
+    assert system.fusion.submap.growth == pytest.approx(1.0), "it grows once"
 
 
 def test_a_submap_measured_as_well_as_the_map_is_of_one_unit_with_it(rng, monkeypatch):

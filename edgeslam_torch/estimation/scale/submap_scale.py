@@ -1,7 +1,7 @@
 """Scale of a submap that began on predicted depths, relative to the map before it."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from edgeslam_torch.estimation.scale.belief import ScaleBelief, contradict
 from edgeslam_torch.noise import SUBMAP_SCALE_LOG
@@ -29,7 +29,7 @@ class SubmapScale:
     @property
     def is_settled(self) -> bool:
         """Whether it is measured as accurately as the map's: then both are one."""
-        return self.measured is not None and self.measured.sigma <= self.before.sigma
+        return self.measured is not None and self.is_known and self.measured.sigma <= self.before.sigma
 
     @property
     def sigma(self) -> float:
@@ -52,3 +52,10 @@ class SubmapScale:
         if not (self.is_settled or contradict(self.measured, self.before)):
             return 1.0
         return math.exp(self.measured.log_scale - self.before.log_scale)
+
+    def grown(self) -> "SubmapScale":
+        """The same of the submap once it has grown by `growth`."""
+        if self.measured is None:
+            return self
+        unit = self.measured.log_scale - math.log(self.growth)
+        return replace(self, measured=replace(self.measured, log_scale=unit))
