@@ -174,20 +174,20 @@ def test_at_an_apparent_end_unknown_sides_are_viewed_and_then_it_ends():
     task, layer, views = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (x < 2.6)), ViewPlanner(0.15)
     at_the_end(task, layer)
     assert task.result(state(2.4, stamp_s=9.0)) is None, "there may be a side corridor"
-    here, headings = state(2.4, stamp_s=10.0), []
+    here, to_left = state(2.4, stamp_s=10.0), []
     while here.stamp_s < 200.0 and not task.result(here):
         here = replace(here, stamp_s=here.stamp_s + 0.1)
         if (wanted := views.taking(here)) is not None:
             turn = np.clip(here.turn_to_rad(wanted.heading_rad), -0.1, 0.1)
             here = replace(here, yaw_rad=here.yaw_rad + float(turn))
-            headings.append(math.sin(here.yaw_rad))
+            to_left.append(math.sin(here.yaw_rad))
         elif not task.looks(here, views) and len(cells := goals(task, layer, here, views)):
             found = layer.centres(cells)
             assert np.linalg.norm(found - [2.4, 0.0], axis=1).max() < 3.0, "near the end only"
             here = replace(here, p_w=np.array([*found[np.abs(found[:, 0] - here.p_w[0]).argmin()], 1.15]))
     assert task.result(here).reached and task.result(here).reason == "the corridor ends"
     assert abs(here.p_w[0] - 2.4) < 0.4
-    assert max(headings) > 0.95 and min(headings) < -0.95, "depth may have closed a mouth on either side"
+    assert max(to_left) > 0.95 and min(to_left) < -0.95, "depth may have closed a mouth on either side"
 
 
 def test_a_mouth_that_depth_closed_is_seen_from_before_it():
