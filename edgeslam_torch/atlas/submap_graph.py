@@ -79,6 +79,8 @@ class _Start:
     sigma_t: float
     """Standard deviation of its centre per axis [map units]."""
     sigma_r_rad: float
+    one_unit: bool
+    """Whether sensors bring the submap to the unit of the first one."""
 
 
 @dataclass(slots=True)
@@ -96,15 +98,15 @@ class SubmapGraph:
     drift: float = 0.0
     """Standard deviation per axis [map units] of the newest keyframe's drift since the first one."""
 
-    def begin(self, piece: int, keyframe: Keyframe, sigma_t: float, sigma_r_rad: float) -> None:
+    def begin(self, piece: int, keyframe: Keyframe, sigma_t: float, sigma_r_rad: float, one_unit: bool = False) -> None:
         """Add a submap that begins at a keyframe in the map, at a pose predicted with standard deviations per axis
-        from the previous submap; infinite ones without sensors."""
+        from the previous submap; infinite ones without sensors. Sensors bring it to the first one's unit or not."""
         before = next((p for r in reversed(self.log.records) if (p := self.map.piece_of(r.keyframe_id)) != piece), None)
         if before is None:
             return
         earlier_t, earlier_r = self.uncertainty(before, self.first, keyframe.centre_w)
         sigma = math.hypot(sigma_t, earlier_t), math.hypot(sigma_r_rad, earlier_r)
-        self.starts[piece] = _Start(keyframe.id, *sigma)
+        self.starts[piece] = _Start(keyframe.id, *sigma, one_unit)
 
     @property
     def first(self) -> int:
@@ -152,7 +154,7 @@ class SubmapGraph:
         if not one_map and BEFORE_S in (one.stamp_s, other.stamp_s):
             return None
         sigma_t, sigma_r = self.uncertainty(mine, theirs, one.centre_w)
-        relative_log = self._relative_log(mine, theirs)
+        relative_log = math.inf if one_map else self._relative_log(mine, theirs)
         if not math.isfinite(sigma_t):
             return Belief(math.inf, math.inf, relative_log) if math.isfinite(relative_log) else None
         drift, steps = self._drift(one, other)
@@ -160,11 +162,13 @@ class SubmapGraph:
         return Belief(sigma_t, sigma_r, DRIFT_LOG * math.sqrt(steps) if one_map else relative_log)
 
     def _relative_log(self, piece: int, other: int) -> float:
-        """Standard deviation of the log scale of one submap relative to another: sensors measure that in which the
-        flight began, whose unit is the map's, and the newest."""
-        scale = self.scale_now()
-        measured = {self.first, self.map.piece_of(self.log.records[-1].keyframe_id)}
-        if not {piece, other} <= measured or SENSORS.isdisjoint(scale.source.split("+")):
+        """Standard deviation of the log scale of one submap relative to another: sensors bring the newest one to the
+        unit of that in which the flight began. Infinite for others."""
+        scale, newest = self.scale_now(), self.map.piece_of(self.log.records[-1].keyframe_id)
+        start = self.starts.get(newest)
+        if start is None or not start.one_unit or {piece, other} != {self.first, newest}:
+            return math.inf
+        if SENSORS.isdisjoint(scale.source.split("+")):
             return math.inf
         return math.hypot(math.sqrt(2.0) * scale.sigma / scale.value, PLACE_LOG)
 

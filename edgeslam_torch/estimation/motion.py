@@ -236,8 +236,15 @@ class MotionFusion:
     @property
     def begun(self) -> PoseEstimate | None:
         """The newest pose in a submap that has no map yet, with the uncertainty of its beginning; None in any other."""
-        begun = self._begun
-        return None if begun is None else PoseEstimate(begun.T, begun.sigma_t, begun.sigma_r_rad)
+        begun, last = self._begun, self._memory.last
+        if begun is None or (last is not None and begun.stamp_s <= last.stamp_s):
+            return None
+        return PoseEstimate(begun.T, begun.sigma_t, begun.sigma_r_rad)
+
+    @property
+    def has_unit(self) -> bool:
+        """Whether velocities or heights have measured the map's unit, to which later submaps are brought."""
+        return self.submap is not None or self.metres.sensor_scale is not None
 
     def up(self) -> Up | None:
         """The vertical in the map, by the IMU or by an attitude that the images do not contradict."""

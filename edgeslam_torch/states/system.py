@@ -162,7 +162,7 @@ class System:
         """A submap begins with a keyframe at the present, predicted pose."""
         predicted = self.fusion.predict(keyframe.stamp_s)
         sigma = (np.inf, np.inf) if predicted is None else (predicted.sigma_t, predicted.sigma_r_rad)
-        self.graph.begin(self.map.piece, keyframe, *sigma)
+        self.graph.begin(self.map.piece, keyframe, *sigma, one_unit=self.fusion.has_unit)
         self.fusion.begin_piece(keyframe.stamp_s, keyframe.T_w_c, *sigma)
 
     # -- keyframes ---------------------------------------------------------------------------------------------

@@ -135,7 +135,9 @@ def test_the_present_of_a_new_piece_of_map_is_where_it_begins(flown):
         now = Present(flown.fusion.snapshot()).pose_at(at_s + 0.05)
         np.testing.assert_allclose(now.T_w_c, T_w_c, atol=1e-9)
         assert now.covariance[0, 0] >= begun[2] ** 2 and now.seen_s == at_s
+        np.testing.assert_allclose(flown.fusion.begun.T_w_c, T_w_c, atol=1e-9)
     flown.fly_on(18.0)
+    assert flown.fusion.begun is None, "it has a map, or the camera is back in an earlier one"
     assert Present(flown.fusion.snapshot()).pose_at(18.0).seen_s > 17.5
 
 

@@ -38,7 +38,7 @@ class Flown:
         }
         self.piece_of = dict.fromkeys(range(6), 0)
         self.predicted = PoseEstimate(placed(5.0), sigma, 0.01)
-        self.begun = None
+        self.begun, self.one_unit = None, True
         self.asked = []
         self.sees_again = {}
         """Anchors that the two newest keyframes share with others."""
@@ -61,7 +61,7 @@ class Flown:
         )
         metres = ScaleEstimate(1.0, 0.02, "telemetry")
         graph = SubmapGraph(slam_map, log, lambda: metres)
-        graph.begin(1, self.keyframes[5], self.between, 0.0)
+        graph.begin(1, self.keyframes[5], self.between, 0.0, one_unit=self.one_unit)
         return SimpleNamespace(
             map=slam_map,
             graph=graph,
@@ -132,18 +132,20 @@ def test_the_gate_includes_the_uncertainty_between_submaps(between, may):
 
 
 @pytest.mark.parametrize(
-    ("metres", "factor", "may"),
+    ("metres", "one_unit", "factor", "may"),
     [
-        (ScaleEstimate(1.0, 0.03, "telemetry"), 2.2, False),
-        (ScaleEstimate(1.0, 0.03, "telemetry"), 1.1, True),
-        (ScaleEstimate(1.0, 0.3, "telemetry"), 2.2, True),
-        (ScaleEstimate(1.0, 0.03, "depth"), 2.2, True),
+        (ScaleEstimate(1.0, 0.03, "telemetry"), True, 2.2, False),
+        (ScaleEstimate(1.0, 0.03, "telemetry"), True, 1.1, True),
+        (ScaleEstimate(1.0, 0.03, "imu"), False, 2.2, True),
+        (ScaleEstimate(1.0, 0.3, "telemetry"), True, 2.2, True),
+        (ScaleEstimate(1.0, 0.03, "depth"), True, 2.2, True),
     ],
 )
 @pytest.mark.parametrize("between", [5.0, np.inf])
-def test_a_link_does_not_double_a_submap_whose_unit_sensors_have_measured(between, metres, factor, may):
+def test_a_link_does_not_double_a_submap_whose_unit_sensors_have_measured(between, metres, one_unit, factor, may):
     """Whether or not sensors say where it begins."""
     flown = Flown(between=between)
+    flown.one_unit = one_unit
     flown.piece_of[5] = 1
     graph = flown.system().graph
     graph.scale_now = lambda: metres
