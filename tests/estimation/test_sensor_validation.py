@@ -264,6 +264,23 @@ def test_a_column_is_proven_by_motion_along_its_axis(told_of):
     assert quiet > 1.0 > 0.1 > max(moved)
 
 
+def test_a_sway_below_the_step_of_a_column_does_not_contradict_it(told_of):
+    """A drone that flies straight sways by less than 0.1 m/s, which truncation reports as zero."""
+    motion = swinging(60.0)
+    T, t = motion.T_w_c.copy(), motion.stamps_s
+    T[:, 0, 3], T[:, 1, 3] = 1.5 * np.sin(0.3 * t), 0.06 * np.sin(1.4 * t)
+
+    def truncated(rng, samples, motion):
+        shown_s = [s.stamp_s + 0.5 for s in samples]
+        v = np.stack([np.interp(shown_s, t, axis) for axis in np.gradient(T[:, :3, 3], t, axis=0).T], axis=1)
+        assert np.abs(v[:, 1]).max() < 0.1
+        return [replace(s, velocity_m_s=np.trunc(10 * x) / 10) for s, x in zip(no_heights(samples), v, strict=True)]
+
+    _, fusion, gauge = told_of(replace(motion, T_w_c=T), truncated)
+    assert fusion.warnings() == []
+    assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.06)
+
+
 @pytest.mark.parametrize(("late_s", "found"), [(0.72, True), (1.2, False), (-2.0, False)])
 def test_a_clock_out_of_range_is_reported_with_its_correction(told_of, late_s, found):
     """The video is 0.5 s late: stamps 1.2 s late give a delay of -0.7 s, where -0.2 is the least that is allowed. The

@@ -13,6 +13,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeslam_torch.estimation.sensors.velocity import Rounding, remainder
 from edgeslam_torch.estimation.telemetry.track import Turn
 from edgeslam_torch.geometry.robust_statistics import median
 from edgeslam_torch.types import FloatArray, IntArray
@@ -142,15 +143,17 @@ def agreement(
     return Agreement(varying, count, dimensions, _correlation(x, y), early)
 
 
-def wrong_columns(seen: FloatArray, reported: FloatArray) -> tuple[float, ...]:
+def wrong_columns(seen: FloatArray, reported: FloatArray, step_m_s: float) -> tuple[float, ...]:
     """Probability of each velocity column to show another motion, as `Agreement.wrong`.
 
     A column is right, of the wrong sign, frozen, or a motion of the same size that is not the camera's. Motion along
-    one axis validates the readings as a whole, but shows nothing about the other columns.
+    one axis validates the readings as a whole, but shows nothing about the other columns; nor does motion below the
+    quantisation step, which is reported as zero.
 
     Args:
         seen: By the images ``(N, 3)`` [map units/s], axes of the columns.
         reported: By telemetry ``(N, 3)`` [m/s].
+        step_m_s: Quantisation step of the columns.
     """
     expected = _ratio(seen, reported) * seen
     noise = _NOISE_M_S**2 + _MAP_SHARE**2 * np.sum(reported**2, axis=1, keepdims=True)
@@ -160,8 +163,11 @@ def wrong_columns(seen: FloatArray, reported: FloatArray) -> tuple[float, ...]:
         residual = np.minimum((reported - predicted) ** 2 / variance, _OUTLIER_SIGMAS**2)
         return np.asarray(np.sum(residual + np.log(variance), axis=0))
 
-    others = cost(-expected, noise), cost(reported.mean(axis=0), noise), cost(expected, noise + power)
-    log_odds = _PRIOR_LOG_ODDS + 0.5 * (np.min(others, axis=0) - cost(expected, noise))
+    lost = [step_m_s * remainder(expected / step_m_s, rounding) for rounding in Rounding]
+    right = np.min([cost(expected - part, noise) for part in lost], axis=0)
+    turned = np.min([cost(part - expected, noise) for part in lost], axis=0)
+    others = turned, cost(reported.mean(axis=0), noise), cost(expected, noise + power)
+    log_odds = _PRIOR_LOG_ODDS + 0.5 * (np.min(others, axis=0) - right)
     return tuple((0.5 - 0.5 * np.tanh(0.5 * log_odds)).tolist())
 
 
