@@ -180,7 +180,7 @@ class Tracking:
         if self._template is None or not self.system.config.flow.enabled:
             return None
         expected = self.system.expected_pose(stamp_s, T_predicted)
-        return self._flow.follow(self._template, seen.grey, T_predicted, expected)
+        return self._flow.follow(self._template, seen.grey, expected.T_c_w, expected)
 
     def _locate_followed(self, followed: Followed, stamp_s: float) -> Located:
         reference = self.system.map.keyframes.get(followed.keyframe_id, self.system.map.latest())
