@@ -186,10 +186,10 @@ class Starting:
 
     def _track(self, attempt: Bootstrap, frame: Frame, view: View) -> Track | None:
         system = self.system
-        T_predicted = system.predict(frame.stamp_s, lost=False)
-        track = attempt.track(view, T_predicted, system.expected_pose(frame.stamp_s, T_predicted))
+        expected = system.expected_pose(frame.stamp_s, system.predict(frame.stamp_s, lost=False))
+        track = attempt.track(view, expected.T_c_w, expected)
         if track is None or track.inliers < system.config.tracking.min_inliers:  # a fast rotation: search everywhere
-            newest = candidates(system.tracker, T_predicted, 1, 0)
+            newest = candidates(system.tracker, expected.T_c_w, 1, 0)
             track = next(filter(None, (match_keyframe(system.tracker, view, k) for k in newest)), None)
             if track is not None and track.inliers < 2 * system.config.tracking.min_inliers:
                 return None

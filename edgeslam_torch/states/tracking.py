@@ -35,6 +35,7 @@ from edgeslam_torch.tracking.keyframe_choice import (
     lost_most,
 )
 from edgeslam_torch.tracking.lazy_view import LazyView
+from edgeslam_torch.tracking.pose_prior import ExpectedPose
 from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, candidates
 from edgeslam_torch.tracking.tracker import Track, View, make_view, parallax_to
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus, IntArray
@@ -82,16 +83,17 @@ class Tracking:
     def step(self, frame: Frame, seen: LazyView, T_predicted: FloatArray) -> Step | None:
         """Track the frame near its prediction; None if that fails."""
         with self.system.map.lock:
-            located = self._locate(frame, seen, T_predicted)
+            expected = self.system.expected_pose(frame.stamp_s, T_predicted)
+            located = self._locate(frame, seen, expected)
             if located is not None:
                 located = self._check_with_sensors(frame, seen, located)
-            return None if located is None else self.arrive(frame, seen, T_predicted, located)
+            return None if located is None else self.arrive(frame, seen, expected, located)
 
-    def _locate(self, frame: Frame, seen: LazyView, T_predicted: FloatArray) -> Located | None:
-        """The frame's pose near a prediction: by flow, by matching, by edges; None if that fails."""
+    def _locate(self, frame: Frame, seen: LazyView, expected: ExpectedPose) -> Located | None:
+        """The frame's pose near the expected one: by flow, by matching, by edges; None if that fails."""
         system = self.system
         with system.timed("tracking"):
-            followed = self._follow(seen, T_predicted, frame.stamp_s)
+            followed = self._follow(seen, expected)
         located = None
         if followed is not None and followed.trusted:
             located = self._locate_followed(followed, frame.stamp_s)
@@ -99,11 +101,11 @@ class Tracking:
         # Points that left the view cannot be followed: match the frame's own keypoints first.
         strong = followed is not None and followed.share >= MIN_SHARE
         if located is None or located.due or not strong:
-            matched = self._match(frame, seen, T_predicted, followed, strong)
+            matched = self._match(frame, seen, expected, followed, strong)
             if matched is None and located is not None and followed is not None:
                 matched = self._on_flow_alone(seen, located, followed, hurry=not strong)
             located = matched
-        return self._by_edges(frame, seen, T_predicted) if located is None else located
+        return self._by_edges(frame, seen, expected) if located is None else located
 
     def _check_with_sensors(self, frame: Frame, seen: LazyView, located: Located) -> Located | None:
         """Repeat the search from the sensors' prediction if the drone's sensors contradict a pose.
@@ -115,7 +117,7 @@ class Tracking:
         predicted, template = self._predicted_by_sensors(frame.stamp_s), self._template
         if predicted is None or predicted[1].allows_pose(predicted[0], located.track.T_c_w):
             return located
-        again = self._locate(frame, seen, predicted[0])
+        again = self._locate(frame, seen, self.system.expected_pose(frame.stamp_s, predicted[0]))
         if again is None or not predicted[1].allows_pose(predicted[0], again.track.T_c_w):
             self._template = template
             self.system.events["contradicted"] += 1
@@ -138,7 +140,7 @@ class Tracking:
         """Continue in the map at a relocalised pose."""
         self.system.events["relocalised"] += 1
         located = self._located(track, seen.view, seen, frame.stamp_s, due=False, relocalised=True)
-        step = self.arrive(frame, seen, T_predicted, located)
+        step = self.arrive(frame, seen, self.system.expected_pose(frame.stamp_s, T_predicted), located)
         self.system.motion.stop()
         self.place_lost(step.keyframe, track.T_c_w, track.anchor)
         return step
@@ -147,11 +149,11 @@ class Tracking:
         """Localise the frames of the present loss from the pose of the frame that followed them."""
         place_lost_frames(self.lost, self.system.tracker, self.system.log, keyframe, T_c_w, anchors)
 
-    def arrive(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Step:
+    def arrive(self, frame: Frame, seen: LazyView, expected: ExpectedPose, located: Located) -> Step:
         """Accept the frame's pose, and insert a keyframe if one is due."""
         system = self.system
         if located.track.inliers < FEW_INLIERS and not located.edges:
-            located = self._with_edges(frame, seen, T_predicted, located)
+            located = self._with_edges(frame, seen, expected, located)
         track, reference = located.track, located.reference
         system.motion.move(frame.stamp_s, track.T_c_w)
         self.relocaliser.forget()
@@ -175,11 +177,10 @@ class Tracking:
 
     # -- by points ---------------------------------------------------------------------------------------------
 
-    def _follow(self, seen: LazyView, T_predicted: FloatArray, stamp_s: float) -> Followed | None:
+    def _follow(self, seen: LazyView, expected: ExpectedPose) -> Followed | None:
         """Optical flow from the last keyframe."""
         if self._template is None or not self.system.config.flow.enabled:
             return None
-        expected = self.system.expected_pose(stamp_s, T_predicted)
         return self._flow.follow(self._template, seen.grey, expected.T_c_w, expected)
 
     def _locate_followed(self, followed: Followed, stamp_s: float) -> Located:
@@ -203,13 +204,13 @@ class Tracking:
         return replace(located, track=track, view=view, due=True)
 
     def _match(
-        self, frame: Frame, seen: LazyView, T_predicted: FloatArray, followed: Followed | None, strong: bool
+        self, frame: Frame, seen: LazyView, expected: ExpectedPose, followed: Followed | None, strong: bool
     ) -> Located | None:
         """Match the frame's own keypoints: where flow fails, or where a ``strong`` flow called a keyframe due."""
         with self.system.timed("features"):
             view = seen.view
         with self.system.timed("tracking"):
-            track, relocalised = self._find(frame, view, T_predicted, followed, strong)
+            track, relocalised = self._find(frame, view, expected, followed, strong)
         if track is None:
             return None
         at_once = followed is not None and lost_most(followed)
@@ -237,20 +238,20 @@ class Tracking:
         return Located(track, reference, parallax_rad, due, uv, inv_sigma, view, relocalised)
 
     def _find(
-        self, frame: Frame, view: View, T_predicted: FloatArray, followed: Followed | None, strong: bool
+        self, frame: Frame, view: View, expected: ExpectedPose, followed: Followed | None, strong: bool
     ) -> tuple[Track | None, bool]:
         """Track near flow's result or the prediction, else relocalise; and whether it was relocalised."""
-        tracker, expected = self.system.tracker, self.system.expected_pose(frame.stamp_s, T_predicted)
+        tracker = self.system.tracker
         if followed is not None and strong:
             track = tracker.track_near(view, followed.track.T_c_w, followed.track.anchor, expected)
             return None if track is None else join(track, followed, view, self.system.config.orb.scale_factor), False
-        track = tracker.track(view, T_predicted, self._recent, expected)
+        track = tracker.track(view, expected.T_c_w, self._recent, expected)
         if track is None and followed is not None:
             # After a jerk, or in a blurred image, the result of flow is nearer than the prediction.
             track = tracker.track_near(view, followed.track.T_c_w, followed.track.anchor, expected)
         if track is not None:
             return track, False
-        track = self._relocalise(frame, view, T_predicted, 0)
+        track = self._relocalise(frame, view, expected.T_c_w, 0)
         return track, track is not None
 
     def _relocalise(self, frame: Frame, view: View, T_predicted: FloatArray, lost_frames: int) -> Track | None:
@@ -289,18 +290,17 @@ class Tracking:
 
     # -- by edges ----------------------------------------------------------------------------------------------
 
-    def _by_edges(self, frame: Frame, seen: LazyView, T_predicted: FloatArray) -> Located | None:
+    def _by_edges(self, frame: Frame, seen: LazyView, expected: ExpectedPose) -> Located | None:
         """The pose from edges alone."""
         with self.system.timed("edges"):
-            expected = self.system.expected_pose(frame.stamp_s, T_predicted).prior(True)
-            alone = self._edge_tracker.refine(seen.grey, T_predicted, None, expected)
+            alone = self._edge_tracker.refine(seen.grey, expected.T_c_w, None, expected.prior(True))
         if alone is None or not alone.is_fixed or self._contradicts_sensors(alone.T_c_w, frame.stamp_s):
             return None
         none = np.zeros(0, dtype=np.int64)
         track = Track(alone.T_c_w, none, none, none, none, alone.covariance)
         return Located(track, self.system.map.latest(), 0.0, False, np.zeros((0, 2)), np.zeros(0), edges=alone.edges)
 
-    def _with_edges(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Located:
+    def _with_edges(self, frame: Frame, seen: LazyView, expected: ExpectedPose, located: Located) -> Located:
         """The pose from edges and few points."""
         system, anchor = self.system, located.track.anchor
         slack = depth_slack_px(system.map.anchors, anchor, located.track.T_c_w, system.camera)
@@ -311,8 +311,7 @@ class Tracking:
             np.zeros((len(anchor), 2)) if slack is None else slack,
         )
         with system.timed("edges"):
-            expected = system.expected_pose(frame.stamp_s, T_predicted).prior(True)
-            both = self._edge_tracker.refine(seen.grey, located.track.T_c_w, points, expected)
+            both = self._edge_tracker.refine(seen.grey, located.track.T_c_w, points, expected.prior(True))
         if both is None or both.edges < MIN_EDGES or both.points.mean() < 0.5:
             return located
         if self._contradicts_sensors(both.T_c_w, frame.stamp_s):

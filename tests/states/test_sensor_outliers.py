@@ -9,6 +9,8 @@ from rendered import CAMERA, film, panels, patchwork
 from edgeslam_torch.config import DepthConfig, MappingConfig, SlamConfig
 from edgeslam_torch.estimation.filter.filter_feed import PoseEstimate
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.motion_terms import Vertical
+from edgeslam_torch.noise import ATTITUDE_RAD
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
 from edgeslam_torch.types import FrameStatus
@@ -23,16 +25,18 @@ the prediction."""
 PREDICTED, TRACKED, RELOCALISED = FrameStatus.PREDICTED, FrameStatus.TRACKED, FrameStatus.RELOCALISED
 STEPS = 11, 15
 """Frames around the larger steps."""
+BRAKES = 0.67, 1.34, 0.67
+"""Steps of a drone that brakes: at the third, constant velocity is off by one repetition."""
 
 
-def wallpaper():
-    """A camera before a papered wall: it moves slowly sideways, turns by three larger steps, then stops."""
+def wallpaper(axis=4, steps=(1, 2, 3)):
+    """A camera before a papered wall: it moves slowly sideways, turns by larger steps, then stops."""
     across = 20
     paper = np.tile(patchwork(np.random.default_rng(5), 128, 40), (across, across, 1))
     side_m = across * PERIOD_M
     u, v = np.array([side_m, 0.0, 0.0]), np.array([0.0, side_m, 0.0])
     world = World([Quad(np.array([-side_m / 2, -side_m / 2, 2.0]), u, v, Texture(paper))])
-    poses = [se3.exp(np.array([0.0, 0.0, 0.0, 0.0, STEP_RAD * np.clip(k - 11, 0, 3), 0.0])) for k in range(23)]
+    poses = [se3.exp(STEP_RAD * turn * np.eye(6)[axis]) for turn in [0.0] * 12 + [*steps] + [steps[-1]] * 8]
     for k, T in enumerate(poses):
         T[0, 3] += 0.01 * k
     return film(world, CAMERA, np.stack(poses), step_s=1 / 15)
@@ -74,6 +78,21 @@ def test_a_prediction_prevents_a_mismatch_on_a_repetitive_wall():
     flight = wallpaper()
     held, alone = (errors_deg(flight, flown(flight, how)) for how in (true_motion(flight), no_filter))
     assert held < 2.0 < 4.0 < alone
+
+
+def test_attitude_prevents_a_mismatch_of_rows_when_a_drone_pitches(monkeypatch):
+    flight = wallpaper(3, BRAKES)
+    alone = errors_deg(flight, flown(flight))
+
+    def vertical(model, reference, stamp_s):
+        there, here = (
+            flight.T_w_c[np.argmin(np.abs(flight.stamps_s - t)), :3, :3].T @ [0.0, -1.0, 0.0]
+            for t in (reference.stamp_s, stamp_s)
+        )
+        return Vertical(here, reference.T_w_c[:3, :3] @ there, ATTITUDE_RAD)
+
+    monkeypatch.setattr("edgeslam_torch.states.system.vertical_since", vertical)
+    assert errors_deg(flight, flown(flight)) < 2.0 < 4.0 < alone
 
 
 def test_wrong_sensors_do_not_change_a_pose_that_images_confirm():
