@@ -22,6 +22,7 @@ from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.estimation.scale.belief import disagreement, mean
 from edgeslam_torch.estimation.scale.submap_scale import SubmapScale
 from edgeslam_torch.estimation.scale_estimator import ScaleEstimator
+from edgeslam_torch.estimation.sensors.attitude import turned
 from edgeslam_torch.estimation.sensors.height import climb
 from edgeslam_torch.estimation.sensors.imu import REACH_S as IMU_REACH_S
 from edgeslam_torch.estimation.sensors.imu import Imu
@@ -322,6 +323,13 @@ class MotionFusion:
     def warnings(self) -> list[str]:
         """Warnings of a rejected depth network or rejected telemetry."""
         return self._trust.warnings() + self._track.warnings() + self.metres.warnings() + self.imu.warnings()
+
+    def turned(self, from_s: float, to_s: float) -> FloatArray | None:
+        """Rotation ``R_c1_c0`` ``(3, 3)`` of the camera between two frames, by a gyroscope or by validated attitude."""
+        by_gyroscope = self.imu.turned(from_s, to_s)
+        if by_gyroscope is not None or not self._trust.turns:
+            return by_gyroscope
+        return turned(self._track, from_s - self.delay_s, to_s - self.delay_s, self.orientation.T_b_c[:3, :3])
 
     def telemetry(self) -> TelemetryModel | None:
         """Present telemetry and its alignment with the map, for refinement; None without any.

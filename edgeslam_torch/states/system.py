@@ -23,7 +23,7 @@ from edgeslam_torch.mapping.motion_terms import vertical_since
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
 from edgeslam_torch.stage_times import timed
 from edgeslam_torch.tracking.motion_model import MotionModel
-from edgeslam_torch.tracking.pose_prior import ExpectedPose, expected_pose
+from edgeslam_torch.tracking.pose_prior import ExpectedPose
 from edgeslam_torch.tracking.relocaliser import Reach, reach_after
 from edgeslam_torch.tracking.tracker import Track, Tracker
 from edgeslam_torch.types import FloatArray, Frame, TelemetrySample
@@ -100,13 +100,14 @@ class System:
 
     def predict(self, stamp_s: float, lost: bool) -> FloatArray:
         """Predicted ``T_c_w``: by the Kalman filter over gaps and when lost, once it has scale and delay; otherwise at
-        constant velocity, with a gyroscope's rotation if there is one."""
+        constant velocity, with the rotation by a gyroscope or by attitude if there is one: a drone that brakes pitches
+        by more in a frame than a wallpaper's rows are apart."""
         gap = stamp_s - self.motion.stamp_s >= MIN_GAP_S
         if self.has_telemetry and (lost or gap or self.motion.velocity_unknown):
             estimate = self.fusion.predict(stamp_s)
             if estimate is not None:
                 return se3.inverse(estimate.T_w_c)
-        T_c_w, R_c_c = self.motion.predict(stamp_s), self.fusion.imu.turned(self.motion.stamp_s, stamp_s)
+        T_c_w, R_c_c = self.motion.predict(stamp_s), self.fusion.turned(self.motion.stamp_s, stamp_s)
         if R_c_c is not None:
             centre = -T_c_w[:3, :3].T @ T_c_w[:3, 3]
             T_c_w[:3, :3] = R_c_c @ self.motion.T_c_w[:3, :3]
@@ -114,10 +115,10 @@ class System:
         return T_c_w
 
     def expected_pose(self, stamp_s: float, T_predicted: FloatArray) -> ExpectedPose:
-        """The predicted pose, levelled by the drone's attitude, with the uncertainty due to accelerations."""
+        """The predicted pose, with the vertical by the drone's attitude and the uncertainty due to accelerations."""
         metric = self.mapping.has_metres
         motion = self.motion.information(stamp_s, self.published.scale) if metric else np.zeros((6, 6))
-        return expected_pose(T_predicted, motion, vertical_since(self.telemetry("every"), self.map.latest(), stamp_s))
+        return ExpectedPose(T_predicted, motion, vertical_since(self.telemetry("every"), self.map.latest(), stamp_s))
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""

@@ -19,40 +19,28 @@ class ExpectedPose:
     """A frame's pose before its image is measured."""
 
     T_c_w: FloatArray
-    """``(4, 4)``; the vertical is where the drone's attitude has it, if that is known."""
+    """``(4, 4)`` as predicted."""
     motion: FloatArray
     """``(6, 6)`` information of a left perturbation, limited by accelerations; zero without a scale."""
     vertical: Vertical | None = None
     """By the drone's attitude."""
 
     def prior(self, on_predicted_depths: bool) -> PosePrior:
-        """The prior; where images measure tilt, attitude has its weight of windows (`mapping.motion_terms`).
+        """The prior: the predicted pose, turned about its centre so that the vertical is where attitude has it; where
+        images measure tilt, attitude has its weight of windows (`mapping.motion_terms`).
 
         Images of few and distant points, or of one plane, hardly distinguish a climb from a pitch, so that attitude
         counts in every frame. On predicted depths, whose errors are common to the whole image, the motion counts, too.
         """
-        information = self.motion.copy() if on_predicted_depths else np.zeros((6, 6))
+        T_c_w, information = self.T_c_w, self.motion.copy() if on_predicted_depths else np.zeros((6, 6))
         if self.vertical is not None:
             samples = GUESSED_IMAGE if on_predicted_depths or self.vertical.held else ATTITUDE * EFFECTIVE_SAMPLES
             up_c = self.vertical.up_c
             across = np.eye(3) - np.outer(up_c, up_c)
             information[3:, 3:] += across / self.vertical.sigma(samples) ** 2
-        return PosePrior(0, self.T_c_w, information)
-
-
-def expected_pose(T_c_w: FloatArray, motion: FloatArray, vertical: Vertical | None) -> ExpectedPose:
-    """A predicted pose ``(4, 4)``, turned about its centre so that the vertical is where it was measured.
-
-    Args:
-        T_c_w: The prediction.
-        motion: Its information ``(6, 6)``.
-        vertical: The vertical in the frame by one attitude.
-    """
-    if vertical is None:
-        return ExpectedPose(T_c_w, motion)
-    T = T_c_w.copy()
-    T[:3] = smallest_rotation(T_c_w[:3, :3] @ vertical.up_w, vertical.up_c) @ T_c_w[:3]
-    return ExpectedPose(T, motion, vertical)
+            T_c_w = T_c_w.copy()
+            T_c_w[:3] = smallest_rotation(self.T_c_w[:3, :3] @ self.vertical.up_w, up_c) @ self.T_c_w[:3]
+        return PosePrior(0, T_c_w, information)
 
 
 def pose_on_anchors(

@@ -23,7 +23,7 @@ def system(R_c_c=None, filtering=True, **fusion):
         motion=motion,
         fusion=SimpleNamespace(
             predict=lambda stamp_s: SimpleNamespace(T_w_c=TOLD) if filtering else None,
-            imu=SimpleNamespace(turned=lambda from_s, to_s: R_c_c),
+            turned=lambda from_s, to_s: R_c_c,
             **fusion,
         ),
         stage_ms={},
@@ -46,7 +46,7 @@ def test_constant_velocity_otherwise(has_telemetry, filtering, stamp_s):
     np.testing.assert_array_equal(System.predict(keyframes, stamp_s, False), keyframes.motion.predict(stamp_s))
 
 
-def test_a_gyroscope_predicts_the_rotation():
+def test_sensors_predict_the_rotation():
     turned = se3.exp(np.array([0.0, 0.0, 0.0, 0.1, -0.2, 0.05]))[:3, :3]
     keyframes = system(turned, filtering=False)
     T_c_w = System.predict(keyframes, 0.2, False)

@@ -9,8 +9,6 @@ from rendered import CAMERA, film, panels, patchwork
 from edgeslam_torch.config import DepthConfig, MappingConfig, SlamConfig
 from edgeslam_torch.estimation.filter.filter_feed import PoseEstimate
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.motion_terms import Vertical
-from edgeslam_torch.noise import ATTITUDE_RAD
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
 from edgeslam_torch.types import FrameStatus
@@ -46,12 +44,16 @@ def no_filter(fusion, stamp_s):
     return None
 
 
-def flown(flight, predicted=no_filter):
-    """Outputs of a flight with a filter that predicts these poses."""
+def no_attitude(from_s, to_s):
+    return None
+
+
+def flown(flight, predicted=no_filter, turned=no_attitude):
+    """Outputs of a flight with a filter that predicts these poses, and an attitude that turns so between frames."""
     config = SlamConfig(depth=DepthConfig(weights="none"), mapping=MappingConfig(sub_pixel=False))
     slam = EdgeSlam(CAMERA, config, depth=flight.depth_function())
     fusion = slam._system.fusion
-    fusion.predict = lambda stamp_s: predicted(fusion, stamp_s)
+    fusion.predict, fusion.turned = lambda stamp_s: predicted(fusion, stamp_s), turned
     return [slam.step(frame) for frame in flight.frames]
 
 
@@ -80,19 +82,15 @@ def test_a_prediction_prevents_a_mismatch_on_a_repetitive_wall():
     assert held < 2.0 < 4.0 < alone
 
 
-def test_attitude_prevents_a_mismatch_of_rows_when_a_drone_pitches(monkeypatch):
+def test_attitude_prevents_a_mismatch_of_rows_when_a_drone_pitches():
     flight = wallpaper(3, BRAKES)
-    alone = errors_deg(flight, flown(flight))
 
-    def vertical(model, reference, stamp_s):
-        there, here = (
-            flight.T_w_c[np.argmin(np.abs(flight.stamps_s - t)), :3, :3].T @ [0.0, -1.0, 0.0]
-            for t in (reference.stamp_s, stamp_s)
-        )
-        return Vertical(here, reference.T_w_c[:3, :3] @ there, ATTITUDE_RAD)
+    def turned(from_s, to_s):
+        R_w_c0, R_w_c1 = (flight.T_w_c[np.argmin(np.abs(flight.stamps_s - t)), :3, :3] for t in (from_s, to_s))
+        return R_w_c1.T @ R_w_c0
 
-    monkeypatch.setattr("edgeslam_torch.states.system.vertical_since", vertical)
-    assert errors_deg(flight, flown(flight)) < 2.0 < 4.0 < alone
+    by_attitude, alone = (errors_deg(flight, flown(flight, turned=by)) for by in (turned, no_attitude))
+    assert by_attitude < 1.0 < 3.0 < alone
 
 
 def test_wrong_sensors_do_not_change_a_pose_that_images_confirm():

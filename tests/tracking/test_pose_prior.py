@@ -11,7 +11,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.anchors import Anchors
 from edgeslam_torch.mapping.motion_terms import Vertical
 from edgeslam_torch.optim.pose_only import PoseConfig
-from edgeslam_torch.tracking.pose_prior import ExpectedPose, expected_pose, pose_on_anchors
+from edgeslam_torch.tracking.pose_prior import ExpectedPose, pose_on_anchors
 
 CAMERA = Camera(640, 480, 460.0, 460.0, 320.0, 240.0)
 LEVEL = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -72,13 +72,13 @@ def leaning(rng, angle_rad):
 
 def test_a_levelled_prediction_keeps_its_centre_and_its_heading(rng):
     leans, upright, vertical = leaning(rng, 0.3)
-    np.testing.assert_allclose(expected_pose(leans, np.zeros((6, 6)), vertical).T_c_w, upright, atol=1e-9)
+    np.testing.assert_allclose(ExpectedPose(leans, np.zeros((6, 6)), vertical).prior(True).T_c_w, upright, atol=1e-9)
 
 
 def test_of_a_levelled_prediction_the_vertical_is_known(rng):
     leans, _, vertical = leaning(rng, 0.3)
     up_c, motion = vertical.up_c, np.diag([4.0] * 3 + [9.0] * 3)
-    expected = expected_pose(leans, motion, vertical)
+    expected = ExpectedPose(leans, motion, vertical)
     on_depths, triangulated = (expected.prior(rests).information for rests in (True, False))
     np.testing.assert_allclose(on_depths[:3], motion[:3])
     assert np.count_nonzero(triangulated[:3]) == np.count_nonzero(triangulated[:, :3]) == 0
@@ -89,15 +89,15 @@ def test_of_a_levelled_prediction_the_vertical_is_known(rng):
 
 def test_an_error_of_the_mount_counts_as_often_as_the_drone_turns(rng):
     leans, _, vertical = leaning(rng, 0.3)
-    turned = expected_pose(leans, np.zeros((6, 6)), replace(vertical, mount_rad=0.1))
+    turned = ExpectedPose(leans, np.zeros((6, 6)), replace(vertical, mount_rad=0.1))
     for rests in (True, False):
         assert np.abs(turned.prior(rests).information).max() <= 0.1**-2
 
 
 def test_without_attitude_a_prediction_stays(rng):
     leans, _, _ = leaning(rng, 0.3)
-    expected = expected_pose(leans, np.eye(6), None)
-    np.testing.assert_array_equal(expected.T_c_w, leans)
+    expected = ExpectedPose(leans, np.eye(6), None)
+    np.testing.assert_array_equal(expected.prior(True).T_c_w, leans)
     np.testing.assert_array_equal(expected.prior(True).information, np.eye(6))
     np.testing.assert_array_equal(expected.prior(False).information, np.zeros((6, 6)))
 
@@ -118,7 +118,7 @@ def test_attitude_tells_a_climb_from_a_pitch_before_a_distant_wall(rng):
     vertical = Vertical(LEVEL[:3, 2], np.array([0.0, 0.0, 1.0]), math.radians(2.0))
     held, alone = (
         pose_on_anchors(
-            anchors, ids, uv, np.ones(300), LEVEL, CAMERA, expected_pose(LEVEL, np.zeros((6, 6)), g), PoseConfig()
+            anchors, ids, uv, np.ones(300), LEVEL, CAMERA, ExpectedPose(LEVEL, np.zeros((6, 6)), g), PoseConfig()
         ).T_c_w
         for g in (vertical, None)
     )
@@ -142,7 +142,7 @@ def test_predicted_depths_that_are_upside_down_do_not_turn_a_climb_into_sinking(
     vertical = Vertical(LEVEL[:3, 2], np.array([0.0, 0.0, 1.0]), math.radians(2.8), held)
     alone, level = (
         pose_on_anchors(anchors, ids, uv, np.ones(300), LEVEL, CAMERA, expected, PoseConfig()).T_c_w
-        for expected in (None, expected_pose(LEVEL, np.zeros((6, 6)), vertical))
+        for expected in (None, ExpectedPose(LEVEL, np.zeros((6, 6)), vertical))
     )
     assert se3.inverse(alone)[2, 3] < -0.02 and tilt_deg(alone) > 1.4
     assert se3.inverse(level)[2, 3] > 0.0 and tilt_deg(level) < 1.1

@@ -96,6 +96,15 @@ def up_directions(
     return UpDirections(frame, R_w_c[:, 2, :], R_w_m[2], UP_RAD * math.sqrt(float(np.median(correlated))))
 
 
+def turned(track: TelemetryTrack, from_s: float, to_s: float, R_b_c: FloatArray) -> FloatArray | None:
+    """Rotation ``R_c1_c0`` ``(3, 3)`` of the camera between two times of telemetry's clock; None over a gap."""
+    ends_s = np.array([from_s, to_s])
+    if not track.covered(ends_s[:1], ends_s[1:])[0]:
+        return None
+    R_w_c = track.attitude(ends_s) @ R_b_c
+    return np.asarray(R_w_c[1].T @ R_w_c[0])
+
+
 def is_steady(track: TelemetryTrack, at_s: FloatArray) -> NDArray[np.bool_]:
     """Whether the drone leans no more than in take-off around times ``(N,)``, for any plausible delay."""
     return np.asarray(track.leaned(at_s, _UNPROVEN_S) < _STEADY_RAD)

@@ -138,8 +138,8 @@ class Comparison:
         seen, reported = moved.moved @ R_w_m.T / duration, reported / duration
         found = agreement(seen, reported, self._least_seen, MIN_SPEED_M_S, early=True)
         R_w = track.axes()[np.searchsorted(track.readings.stamp_s, 0.5 * (moved.from_s + moved.to_s))]
-        in_columns = [np.einsum("nwa,nw->na", R_w, v) for v in (seen, at_camera / duration)]
-        wrong = wrong_columns(*in_columns, self._flight.config.velocity_step_m_s)
+        seen_b, reported_b = (np.einsum("nwa,nw->na", R_w, v) for v in (seen, at_camera / duration))
+        wrong = wrong_columns(seen_b, reported_b, self._flight.config.velocity_step_m_s)
         broken = tuple(name for name, share in zip(VELOCITY, wrong, strict=True) if share > SURELY_WRONG)
         return replace(found, broken=broken, wrong=wrong)
 
