@@ -30,6 +30,10 @@ PATH_RATIO_LOG = 0.25
 
 ATTITUDE_RAD = math.radians(0.36)
 """Of one reading: 1 deg / sqrt(12) of quantisation, which repeats in hover."""
+ATTITUDE_STEP_RAD = math.radians(1.0)
+"""Quantisation step of the SDK's attitude: a change by one shows no motion."""
+READING_S = 0.1
+"""Between two readings. What the drone leans meanwhile is the error of an attitude interpolated between them."""
 FIRST_ATTITUDE_RAD = math.radians(1.0)
 """Of the first attitude, per axis: whole degrees, and the drift since power-on."""
 ATTITUDE_WALK_RAD_SQRT_S = 0.05

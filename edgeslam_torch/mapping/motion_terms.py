@@ -9,7 +9,7 @@ import numpy as np
 from edgeslam_torch.estimation.acceleration_prior import inertia
 from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.map.keyframe import Keyframe
-from edgeslam_torch.noise import ATTITUDE_RAD
+from edgeslam_torch.noise import ATTITUDE_RAD, ATTITUDE_STEP_RAD, READING_S
 from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
 from edgeslam_torch.types import FloatArray
 
@@ -51,12 +51,13 @@ class Vertical:
     """Standard deviation per axis of a single attitude."""
     held: bool = False
     """Whether the frame rests on guesses whatever the image shows: the map is new and has no metric scale."""
-    mount_rad: float = 0.0
-    """The same by the camera's mount: its error turns with the drone, and no other frame reduces it."""
+    systematic_rad: float = 0.0
+    """The same by the camera's mount, whose error turns with the drone, and by what the drone leaned between two
+    readings: no pixel of the image reduces it."""
 
     def sigma(self, samples: float) -> float:
         """Standard deviation per axis [rad], if this number of correlated reprojections counts as one."""
-        return math.hypot(self.sigma_rad / math.sqrt(samples), self.mount_rad)
+        return math.hypot(self.sigma_rad / math.sqrt(samples), self.systematic_rad)
 
 
 def vertical_since(model: TelemetryModel | None, reference: Keyframe, stamp_s: float) -> Vertical | None:
@@ -68,9 +69,12 @@ def vertical_since(model: TelemetryModel | None, reference: Keyframe, stamp_s: f
     up = model.up(stamps_s)
     if up is None or len(up.frame) < 2:
         return None
-    turned = float(np.diff(model.track.yaw(stamps_s - model.delay_s))[0])
+    at_s = stamps_s - model.delay_s
+    turned = float(np.diff(model.track.yaw(at_s))[0])
     mount_rad = 2.0 * abs(math.sin(0.5 * turned)) * model.mount_sigma_rad
-    return Vertical(up.up_c[1], reference.T_w_c[:3, :3] @ up.up_c[0], up.sigma_rad, model.holds_level, mount_rad)
+    between_rad = np.maximum(model.track.leaned(at_s, READING_S) - ATTITUDE_STEP_RAD, 0.0)
+    systematic_rad = math.hypot(mount_rad, *between_rad)
+    return Vertical(up.up_c[1], reference.T_w_c[:3, :3] @ up.up_c[0], up.sigma_rad, model.holds_level, systematic_rad)
 
 
 def motion_factors(

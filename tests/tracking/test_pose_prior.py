@@ -89,7 +89,7 @@ def test_of_a_levelled_prediction_the_vertical_is_known(rng):
 
 def test_an_error_of_the_mount_counts_as_often_as_the_drone_turns(rng):
     leans, _, vertical = leaning(rng, 0.3)
-    turned = ExpectedPose(leans, np.zeros((6, 6)), replace(vertical, mount_rad=0.1))
+    turned = ExpectedPose(leans, np.zeros((6, 6)), replace(vertical, systematic_rad=0.1))
     for rests in (True, False):
         assert np.abs(turned.prior(rests).information).max() <= 0.1**-2
 
