@@ -14,13 +14,17 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.fuse import look_for, merge, observe_or_pair
+from edgeslam_torch.noise import VISUAL_DRIFT, VISUAL_DRIFT_TURN
 from edgeslam_torch.optim.pose_only import refine_pose
 from edgeslam_torch.types import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
-RADIUS_PX = 30.0
-"""Search radius at pyramid level 0: 3 degrees at 525 px, drift of 6 % of the depth."""
+NEAR_PX, FAR_PX = 5.0, 30.0
+"""Search radius at pyramid level 0 for a camera that has hardly moved in between, and the largest: 3 degrees at 525 px,
+drift of 6 % of the depth. In between, what the way allows: on wallpaper, the next repetition fits as well."""
+SURE = 3.0
+"""Standard deviations of the drift that are searched."""
 RATIO = 0.85
 """Maximum ratio of nearest to second nearest descriptor distance."""
 MIN_INLIERS = 15
@@ -69,7 +73,8 @@ def reobserve(slam_map: SlamMap, camera: Camera, keyframe: Keyframe) -> float | 
     anchors, growth = slam_map.anchors, slam_map.scale_factor
     ids = slam_map.anchors_seen_by([old, *slam_map.covisible(old, 5)])
     ids = ids[anchors.alive[ids] & ~anchors.from_depth[ids]]
-    found, keypoint, error = look_for(slam_map, camera, keyframe, ids, RADIUS_PX, 1.0, RATIO)
+    radius_px = min(NEAR_PX + SURE * _drift_px(slam_map, camera, old, keyframe), FAR_PX)
+    found, keypoint, error = look_for(slam_map, camera, keyframe, ids, radius_px, 1.0, RATIO)
     if len(found) < MIN_INLIERS:
         return None
     inliers = _agreeing(keyframe, anchors.p_w[found], keypoint, camera, growth)
@@ -78,6 +83,16 @@ def reobserve(slam_map: SlamMap, camera: Camera, keyframe: Keyframe) -> float | 
     merge(slam_map, [observe_or_pair(slam_map, keyframe, found[inliers], keypoint[inliers])])
     logger.info("keyframe of frame %d joined with that of frame %d", keyframe.frame_index, old.frame_index)
     return float(np.median(np.linalg.norm(error[inliers], axis=1)))
+
+
+def _drift_px(slam_map: SlamMap, camera: Camera, old: Keyframe, new: Keyframe) -> float:
+    """Standard deviation [px] of the map's drift along the keyframes between two, at the newer one's depth."""
+    between = [slam_map.keyframes[id] for id in sorted(slam_map.keyframes) if old.id <= id <= new.id]
+    path = np.linalg.norm(np.diff([k.centre_w for k in between], axis=0), axis=1).sum()
+    axis = np.stack([k.T_c_w[2, :3] for k in between])
+    turn_rad = np.arccos(np.clip((axis[1:] * axis[:-1]).sum(axis=1), -1.0, 1.0)).sum()
+    depth = slam_map.median_depth(new) or np.inf
+    return float(camera.fx * np.hypot(VISUAL_DRIFT * path / depth, VISUAL_DRIFT_TURN * turn_rad))
 
 
 def _agreeing(

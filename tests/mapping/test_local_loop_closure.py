@@ -1,5 +1,6 @@
 """A returning camera observes its old anchors again despite drift."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +17,9 @@ from edgeslam_torch.optim.problem import LmConfig
 LATER = (3, 4, 5)
 
 
-def drifted(rng, drift, same_place=True):
-    """Views 3 to 5 with anchors of their own, all moved by ``drift``; the last of them stands where view 1 stood."""
+def drifted(rng, drift, same_place=True, turn_rad=0.0):
+    """Views 3 to 5 with anchors of their own, all moved by ``drift`` or turned about view 1; the last of them stands
+    where view 1 stood."""
     points = PointMap(rng, 400, 6)
     points.world.T_c_w[5] = points.world.T_c_w[1]
     last = points.keyframes[5]
@@ -27,6 +29,8 @@ def drifted(rng, drift, same_place=True):
     last.aligned_px = points.keyframes[1].aligned_px.copy()
     last.anchor = np.full(len(seen), -1, dtype=np.int64)
     last.T_c_w = points.world.T_c_w[1].copy()
+    if turn_rad:
+        drift = se3.inverse(last.T_c_w) @ se3.exp(np.array([0.0, 0.0, 0.0, turn_rad, 0.0, 0.0])) @ last.T_c_w
     points.fill((0, 1, 2))
     known = np.unique(np.concatenate([points.point_of[v] for v in LATER]))
     if not same_place:
@@ -75,6 +79,15 @@ def test_a_different_place_is_not_matched(rng, drift):
     held = points.keyframes[5].anchor.copy()
     assert reobserve(points.map, CAMERA, points.keyframes[5]) is None
     check_map(points.map)
+    np.testing.assert_array_equal(points.keyframes[5].anchor, held)
+
+
+def test_what_the_way_since_cannot_have_drifted_is_no_revisit(rng):
+    """A neighbouring repetition of wallpaper fits as well as the place itself: here 5 degrees aside."""
+    points = drifted(rng, np.eye(4), turn_rad=math.radians(5.0))
+    held = points.keyframes[5].anchor.copy()
+    assert revisit_candidate(points.map, points.keyframes[5]) is points.keyframes[1]
+    assert reobserve(points.map, CAMERA, points.keyframes[5]) is None
     np.testing.assert_array_equal(points.keyframes[5].anchor, held)
 
 
