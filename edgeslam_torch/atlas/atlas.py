@@ -172,7 +172,12 @@ class Atlas:
         if found is None or (not found.by_images and self._is_flat(found)):
             return None
         belief = self.graph.between(keyframe, other, found.depth)
-        return found if belief is None or belief.allows(found.S, keyframe.T_c_w) else None
+        if belief is None:
+            return found
+        if loop or not np.isfinite(belief.sigma_log):
+            return found if belief.allows(found.S, keyframe.T_c_w) else None
+        allowed = belief.allows_pose(keyframe.T_c_w, sim3.moved_camera(found.S, keyframe.T_c_w))
+        return found.in_unit(belief.sigma_log) if allowed else None
 
     def _is_flat(self, one: Link) -> bool:
         """Whether the anchors of a link lie on one plane, such as a wall with repetitive wallpaper."""

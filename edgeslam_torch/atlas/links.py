@@ -6,11 +6,12 @@ ratios must agree. A camera that rotates in place has no such pairs; within one 
 the other keyframe, relocalised in the first submap, must confirm the similarity.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgeslam_torch.atlas.submap_graph import Belief
+from edgeslam_torch.atlas.submap_graph import PLACE_LOG, Belief
+from edgeslam_torch.gate import passes
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.robust_statistics import robust_sigma
 from edgeslam_torch.map.keyframe import Keyframe
@@ -75,6 +76,23 @@ class Link:
         sigma_log = float(np.linalg.norm([self.sigma_log, other.sigma_log, LINK_LOG]))
         scales = float(np.log(sim3.scale_of(self.S) / sim3.scale_of(other.S)))
         return Belief(LINK_PLACE * self.depth, LINK_RAD, sigma_log).allows_pose(here, there, scales)
+
+    def in_unit(self, sigma_log: float) -> "Link":
+        """The same place with the scale that sensors and images have together.
+
+        Sensors measure the unit of whole submaps, images that of one view, which predicted depths may have changed: a
+        submap of twelve metres was scaled by 1.6 where the camera had turned before a bare wall. A view that
+        contradicts its submap does not count.
+
+        Args:
+            sigma_log: Standard deviation of the log scale between the submaps by sensors, which have them in one unit.
+        """
+        by_image = np.hypot(self.sigma_log, PLACE_LOG)
+        both, measured = by_image**2 + sigma_log**2, np.log(sim3.scale_of(self.S))
+        share = sigma_log**2 / both if passes(np.array([measured]), np.array([[both]])) else 0.0
+        change, centre = np.exp((share - 1.0) * measured), self.keyframe.centre_w
+        S = self.S @ sim3.compose(change, np.eye(3), (1.0 - change) * centre)
+        return replace(self, S=S, sigma_log=float(sigma_log * by_image / np.sqrt(both)))
 
 
 def view_of(keyframe: Keyframe, scale_factor: float) -> View:

@@ -162,15 +162,15 @@ class SubmapGraph:
         return Belief(sigma_t, sigma_r, DRIFT_LOG * math.sqrt(steps) if one_map else relative_log)
 
     def _relative_log(self, piece: int, other: int) -> float:
-        """Standard deviation of the log scale of one submap relative to another: sensors bring the newest one to the
-        unit of that in which the flight began. Infinite for others."""
+        """Standard deviation of the log scale of one submap relative to another by sensors, which bring the newest one
+        to the unit of that in which the flight began. Infinite for others."""
         scale, newest = self.scale_now(), self.map.piece_of(self.log.records[-1].keyframe_id)
         start = self.starts.get(newest)
         if start is None or not start.one_unit or {piece, other} != {self.first, newest}:
             return math.inf
         if SENSORS.isdisjoint(scale.source.split("+")):
             return math.inf
-        return math.hypot(math.sqrt(2.0) * scale.sigma / scale.value, PLACE_LOG)
+        return math.sqrt(2.0) * scale.sigma / scale.value
 
     def _drift(self, one: Keyframe, other: Keyframe) -> tuple[float, int]:
         """Standard deviation of the drift per axis along the path between two keyframes with the least of it, over

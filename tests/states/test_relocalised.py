@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from edgeslam_torch.atlas.links import Link
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.atlas.submap_graph import SubmapGraph
 from edgeslam_torch.estimation.filter.filter_feed import PoseEstimate
@@ -132,27 +133,32 @@ def test_the_gate_includes_the_uncertainty_between_submaps(between, may):
 
 
 @pytest.mark.parametrize(
-    ("metres", "one_unit", "factor", "may"),
+    ("metres", "one_unit", "factor", "scale"),
     [
-        (ScaleEstimate(1.0, 0.03, "telemetry"), True, 2.2, False),
-        (ScaleEstimate(1.0, 0.03, "telemetry"), True, 1.1, True),
-        (ScaleEstimate(1.0, 0.03, "imu"), False, 2.2, True),
-        (ScaleEstimate(1.0, 0.3, "telemetry"), True, 2.2, True),
-        (ScaleEstimate(1.0, 0.03, "depth"), True, 2.2, True),
+        (ScaleEstimate(1.0, 0.03, "telemetry"), True, 2.2, 1.0),
+        (ScaleEstimate(1.0, 0.03, "telemetry"), True, 1.1, 1.025),
+        (ScaleEstimate(1.0, 0.3, "telemetry"), True, 2.2, 2.15),
+        (ScaleEstimate(1.0, 0.03, "imu"), False, 2.2, None),
+        (ScaleEstimate(1.0, 0.03, "depth"), True, 2.2, None),
     ],
 )
 @pytest.mark.parametrize("between", [5.0, np.inf])
-def test_a_link_does_not_double_a_submap_whose_unit_sensors_have_measured(between, metres, one_unit, factor, may):
-    """Whether or not sensors say where it begins."""
+def test_a_link_does_not_double_a_submap_whose_unit_sensors_have_measured(between, metres, one_unit, factor, scale):
+    """Whether or not sensors say where it begins; images alone have the scale where sensors have no common unit."""
     flown = Flown(between=between)
     flown.one_unit = one_unit
     flown.piece_of[5] = 1
     graph = flown.system().graph
     graph.scale_now = lambda: metres
-    camera = flown.keyframes[5]
+    camera, none = flown.keyframes[5], np.zeros(0, np.int64)
     S = sim3.compose(factor, np.eye(3), (1.0 - factor) * camera.centre_w)
     belief = graph.between(camera, flown.keyframes[0], 2.0)
-    assert (belief is None or belief.allows(S, se3.inverse(placed(5.0)))) == may
+    assert belief is None or belief.allows(S, se3.inverse(placed(5.0))) or scale is not None
+    if scale is not None:
+        found = Link(camera, flown.keyframes[0], S, 0.02, none, none, 2.0).in_unit(belief.sigma_log)
+        assert sim3.scale_of(found.S) == pytest.approx(scale, rel=0.02)
+        there = (sim3.moved_camera(x, se3.inverse(placed(5.0))) for x in (S, found.S))
+        np.testing.assert_allclose(*there, atol=1e-9)
 
 
 @pytest.mark.parametrize(("between", "may"), [(0.1, False), (np.inf, True)])
