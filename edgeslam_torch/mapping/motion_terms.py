@@ -28,6 +28,8 @@ image, distinguish rotation from translation (docs/decisions/05-first-frame.md).
 GUESSED_IMAGE = 3000.0
 """The same for a single image: more than it has, since it does not measure tilt. A window of several views does, and
 this weight would bend it where the attitude is wrong."""
+SURE = 3.0
+"""Standard deviations from which on a tilt contradicts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +56,11 @@ class Vertical:
     systematic_rad: float = 0.0
     """The same by the camera's mount, whose error turns with the drone, and by what the drone leaned between two
     readings: no pixel of the image reduces it."""
+
+    def contradicts(self, T_c_w: FloatArray) -> bool:
+        """Whether it contradicts the tilt of a tracked pose ``(4, 4)``: on wrong depths a climb looks like a pitch."""
+        sigma_rad = math.hypot(math.sqrt(2.0) * ATTITUDE_RAD, self.systematic_rad)
+        return float(np.linalg.norm(np.cross(T_c_w[:3, :3] @ self.up_w, self.up_c))) > SURE * sigma_rad
 
     def sigma(self, samples: float) -> float:
         """Standard deviation per axis [rad], if this number of correlated reprojections counts as one."""

@@ -96,7 +96,7 @@ class Tracking:
             followed = self._follow(seen, expected)
         located = None
         if followed is not None and followed.trusted:
-            located = self._locate_followed(followed, frame.stamp_s)
+            located = self._locate_followed(followed, expected, frame.stamp_s)
         # While the worker is busy no keyframe can be created; matching then finds newly mapped anchors.
         # Points that left the view cannot be followed: match the frame's own keypoints first.
         strong = followed is not None and followed.share >= MIN_SHARE
@@ -160,7 +160,7 @@ class Tracking:
         self._recent = track.anchor if track.inliers else self._recent
         system.see(frame.stamp_s, track)
         before = system.log.relative_to_last(track.T_c_w)
-        due = located.due and not self._adds_nothing(frame.stamp_s, located)
+        due = located.due and (_leans(expected, track) or not self._adds_nothing(frame.stamp_s, located))
         keyframe = self._insert_keyframe(frame, seen, located) if due else None
         if keyframe is not None and keyframe.id in system.map.keyframes:
             reference = keyframe
@@ -183,10 +183,11 @@ class Tracking:
             return None
         return self._flow.follow(self._template, seen.grey, expected.T_c_w, expected)
 
-    def _locate_followed(self, followed: Followed, stamp_s: float) -> Located:
+    def _locate_followed(self, followed: Followed, expected: ExpectedPose, stamp_s: float) -> Located:
         reference = self.system.map.keyframes.get(followed.keyframe_id, self.system.map.latest())
         parallax_rad = parallax_to(reference, followed.track, self.system.map.anchors.p_w)
-        due = due_by_flow(followed, parallax_rad, stamp_s - self.system.keyframe_s, self.system.config.mapping)
+        since_s, leans = stamp_s - self.system.keyframe_s, _leans(expected, followed.track)
+        due = due_by_flow(followed, parallax_rad, since_s, self.system.config.mapping, leans)
         inv_sigma = self.system.config.orb.scale_factor ** -followed.octave.astype(np.float64)
         return Located(followed.track, reference, parallax_rad, due, followed.uv, inv_sigma)
 
@@ -371,6 +372,11 @@ class Tracking:
         if self.system.map_keyframes(new):
             newest = new[-1][1]
             self._recent = newest.anchor[newest.anchor >= 0]
+
+
+def _leans(expected: ExpectedPose, track: Track) -> bool:
+    """Whether the drone's attitude contradicts a tracked pose."""
+    return expected.vertical is not None and expected.vertical.contradicts(track.T_c_w)
 
 
 def _in_words(located: Located) -> str:

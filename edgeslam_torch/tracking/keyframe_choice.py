@@ -52,10 +52,12 @@ def lost_most(followed: Followed) -> bool:
     return followed.share < AT_ONCE
 
 
-def due_by_flow(followed: Followed, parallax_rad: float, since_keyframe_s: float, config: MappingConfig) -> bool:
+def due_by_flow(
+    followed: Followed, parallax_rad: float, since_keyframe_s: float, config: MappingConfig, leans: bool = False
+) -> bool:
     """Whether a frame tracked by flow should become a keyframe; arguments as in `is_due`."""
     changed, at_once = lost_sight(followed), lost_most(followed)
-    return is_due(changed, parallax_rad, since_keyframe_s, config, at_once)
+    return is_due(changed, parallax_rad, since_keyframe_s, config, at_once, leans)
 
 
 def few_matches(track: Track, reference: Keyframe, slam_map: SlamMap) -> bool:
@@ -67,7 +69,12 @@ def few_matches(track: Track, reference: Keyframe, slam_map: SlamMap) -> bool:
 
 
 def is_due(
-    changed: bool, parallax_rad: float, since_keyframe_s: float, config: MappingConfig, at_once: bool = False
+    changed: bool,
+    parallax_rad: float,
+    since_keyframe_s: float,
+    config: MappingConfig,
+    at_once: bool = False,
+    leans: bool = False,
 ) -> bool:
     """Whether a frame should become a keyframe.
 
@@ -77,13 +84,13 @@ def is_due(
         since_keyframe_s: Time since the last one.
         config: Thresholds.
         at_once: Ignore ``keyframe_min_gap_s``: `lost_most`.
+        leans: The drone's attitude contradicts the pose; a window weighs both.
     """
     if since_keyframe_s < (SHORTEST_GAP_S if at_once else config.keyframe_min_gap_s):
         return False
     moved = parallax_rad > np.deg2rad(config.keyframe_parallax_deg)
-    overdue = since_keyframe_s >= config.keyframe_max_gap_s and parallax_rad > np.deg2rad(
-        0.25 * config.keyframe_parallax_deg
-    )
+    moved_little = parallax_rad > np.deg2rad(0.25 * config.keyframe_parallax_deg)
+    overdue = since_keyframe_s >= config.keyframe_max_gap_s and (moved_little or leans)
     return changed or moved or overdue
 
 
