@@ -37,6 +37,9 @@ _PLACED_M = 0.3
 """Standard deviation of depth [m] above which a ray only frees cells and marks none as occupied."""
 MAX_VIEWS = 240
 """Views stored to rebuild the grid after a map correction: 24 m of flight at top speed."""
+_LAST_M = 1.0
+"""Way flown that is kept where all else is forgotten: cells nearer than 0.6 m are below and above the picture, and dead
+reckoning over a metre errs by less than the hull."""
 _MAX_FLOWN = 4000
 """Points of the path flown that are kept: more than four minutes at 15 Hz."""
 _SAME_M, _SAME_COS, _MAX_SAME = 0.1, np.cos(np.radians(4.0)), 3
@@ -141,10 +144,18 @@ class Space:
         self._build()
 
     def forget_before(self, seen_s: float) -> None:
-        """Drop everything but the views since a time, and contacts: no view shows what was felt."""
+        """Drop everything but the views since a time, the last metre flown, and contacts.
+
+        No view shows what was felt, nor what is close beside the drone: the way that it came is its way out of a dead
+        end.
+        """
         kept = [view for view in self._views if view.stamp_s >= seen_s]
         self._views = deque(kept, maxlen=MAX_VIEWS)
-        self._flown, self._flown_m = Places(size=3), []
+        p_w = self._flown.p_w
+        far = np.flatnonzero(np.linalg.norm(p_w - p_w[-1:], axis=1) > _LAST_M)
+        lately = slice(int(far[-1]) + 1 if len(far) else 0, None)
+        self._flown.keep(lately)
+        self._flown_m = self._flown_m[lately]
         self._build()
 
     def doubt_solids(self) -> None:

@@ -246,17 +246,19 @@ def test_path_flown_follows_grid_and_map():
     assert not space.was_at(np.array([50.0, 0.0]))
 
 
-def test_older_views_can_be_dropped_and_contacts_stay():
+def test_older_views_can_be_dropped_but_contacts_and_the_last_metre_flown_stay():
     space = Space()
     for stamp_s, yaw in ((1.0, 0.0), (1.2, 0.0), (1.4, 0.0), (5.0, np.pi / 2), (5.2, np.pi / 2), (5.4, np.pi / 2)):
         space.observe(replace(facing_a_wall(yaw=yaw), stamp_s=stamp_s))
-    space.flown(np.array([-3.0, 0.0, 1.15]), 0.3)
+    for x in (-3.0, -0.5, -0.4):
+        space.flown(np.array([x, 0.0, 1.15]), 0.3)
     space.add_contact(Contact(np.array([0.0, -2.0, 1.15]), np.array([0.0, -1.0])), 0.3)
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 1.55, 0.05)[0] and cell(layer, 0.05, 1.55)[0] and cell(layer, -3.0, 0.0)[0]
     space.forget_before(5.0)
     layer = space.layer(1.15, 0.15)
-    assert cell(layer, 0.05, 1.55) == (True, False)
+    assert cell(layer, 0.05, 1.55) == cell(layer, -0.55, 0.0) == (True, False)
+    assert space.was_at(np.array([[-0.5, 0.0], [-3.0, 0.0]])).tolist() == [True, False]
     for x, y in ((1.55, 0.05), (2.05, 0.05), (-3.0, 0.0)):
         assert cell(layer, x, y) == (False, False)
     assert cell(layer, 0.0, -2.3) == (False, True)
