@@ -10,6 +10,7 @@ from swung import T_B_C, swinging
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.displacement import TelemetryModel
+from edgeslam_torch.estimation.sensors.attitude import turned as between
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.noise import HEADING_DRIFT_RAD_S, HEADING_RAD, TURN_SHARE
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
@@ -94,3 +95,16 @@ def test_headings_after_a_jump_of_yaw_do_not_pass(rng):
     assert told.passes(true[told.frame] @ bend)
     told, true, _ = flown(rng, swinging(14.0), turn=2.0, spoil=jumps)
     assert not told.passes(true[told.frame])
+
+
+def test_attitude_turns_the_camera_between_two_frames_but_not_across_a_gap(rng):
+    motion = swinging(14.0)
+    track = TelemetryTrack("world", 0.35)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()
+    track.add([s for s in samples if not 8.0 < s.stamp_s < 9.0])
+    for i, j in ((60, 62), (100, 130)):
+        R_c1_c0 = between(track, *motion.stamps_s[[i, j]], T_B_C[:3, :3])
+        true = motion.T_w_c[j, :3, :3].T @ motion.T_w_c[i, :3, :3]
+        assert np.degrees(Rotation.from_matrix(R_c1_c0.T @ true).magnitude()) < 0.3
+    assert between(track, 7.9, 9.1, T_B_C[:3, :3]) is None
+    assert between(track, 13.9, 14.5, T_B_C[:3, :3]) is None, "no reading yet"

@@ -30,6 +30,7 @@ from edgeslam_torch.mapping.refinement import (
 )
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
+from edgeslam_torch.types import TelemetrySample
 
 T_B_C = camera_on_body()
 
@@ -346,3 +347,17 @@ def test_a_weakly_connected_keyframe_stays_at_a_plausible_pose(rng, metres):
     refine(points.map, window, CAMERA, solver, silent)
     assert np.linalg.norm(first.centre_w - right) < min(1.05 / metres, 0.25 * off)
     check_map(points.map)
+
+
+def test_an_attitude_between_two_readings_is_as_uncertain_as_what_the_drone_leaned(halves):
+    """A drone that pitches by six degrees within a reading's time; before and after it stands still."""
+    t = np.arange(-1.0, 6.0, 0.1)
+    rpy_rad = np.zeros((len(t), 3))
+    rpy_rad[t > 2.45, 1] = math.radians(6.0)
+    track = TelemetryTrack("world", 0.35)
+    track.add([TelemetrySample(s, np.zeros(3), rpy) for s, rpy in zip(t.tolist(), rpy_rad, strict=True)])
+    model = TelemetryModel(track, FusionConfig(), T_B_C, np.eye(3), 0.0, 0.0, 1.0, 0.01, True, None, truncates=0.0)
+    first = replace(halves.keyframes[0], stamp_s=0.0)
+    systematic_deg = [math.degrees(vertical_since(model, first, s).systematic_rad) for s in (1.5, 2.45, 3.5)]
+    assert systematic_deg[0] < 0.1 and systematic_deg[2] < 0.1
+    assert 2.0 < systematic_deg[1] < 6.0

@@ -229,6 +229,8 @@ def test_keyframe_by_view_change_parallax_or_time_but_not_at_once():
     assert is_due(True, little, 0.067, config, at_once=True)
     assert not is_due(True, little, 0.033, config, at_once=True)
     assert not is_due(False, little, 33.0, config)  # a drone that hovers makes no keyframes
+    assert is_due(False, little, 1.0, config, leans=True)
+    assert not is_due(False, little, 0.97, config, leans=True)  # at most one a second
 
 
 def test_few_matches_is_decided_by_stable_anchors(scene):

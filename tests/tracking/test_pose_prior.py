@@ -87,6 +87,17 @@ def test_of_a_levelled_prediction_the_vertical_is_known(rng):
     assert np.dot(on_depths[3:, 3:] @ across, across) > 5.0 * np.dot(triangulated[3:, 3:] @ across, across) > 0.0
 
 
+@pytest.mark.parametrize(
+    ("lean_deg", "between_deg", "contradicts"), [(3.0, 0.0, True), (1.0, 0.0, False), (3.0, 2.0, False)]
+)
+def test_a_tilt_is_contradicted_beyond_what_attitude_may_err(rng, lean_deg, between_deg, contradicts):
+    """By a degree it may err, and by what the drone leaned between two readings."""
+    leans, upright, vertical = leaning(rng, math.radians(lean_deg))
+    vertical = replace(vertical, systematic_rad=math.radians(between_deg))
+    assert vertical.contradicts(leans) == contradicts
+    assert not vertical.contradicts(upright)
+
+
 def test_an_error_of_the_mount_counts_as_often_as_the_drone_turns(rng):
     leans, _, vertical = leaning(rng, 0.3)
     turned = ExpectedPose(leans, np.zeros((6, 6)), replace(vertical, systematic_rad=0.1))

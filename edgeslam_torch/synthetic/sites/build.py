@@ -24,7 +24,7 @@ from edgeslam_torch.types import FloatArray
 Rng = np.random.Generator
 GOAL_HEIGHT_M = 1.1
 JUDGED = ("cluttered_room", "corridor", "l_corridor", "two_rooms", "blank_walls")
-SITES = (*JUDGED, "t_corridor", "doors", "glass", "mirror", "people")
+SITES = (*JUDGED, "t_corridor", "doors", "six_rooms", "glass", "mirror", "people")
 """Scenes with a start and a goal. The first five are static and judged; glass, mirror and people are flown, and nothing
 is promised."""
 _EPS_M = 1e-6

@@ -19,8 +19,8 @@ REACHED_M = 0.35
 """Distance to the true goal that counts as reached when the planner reports it."""
 HOME_M = 0.3
 """Distance to the true take-off that counts as home."""
-EXPLORED_S, FOLLOWED_S = 180.0, 100.0
-"""Time to explore a room and its neighbours, and to follow a corridor."""
+EXPLORED_S, FOLLOWED_S = 300.0, 100.0
+"""Time to explore a building of six rooms, and to follow a corridor."""
 _END_M = 1.6
 """Distance to a corridor's true end that counts as reached; the drone stops 0.6 m before a wall."""
 _SAME_EXIT_M, _SAME_EXIT_COS = 0.5, np.cos(np.radians(35.0))
@@ -88,7 +88,7 @@ BEHAVIOURS = {
     "goto": Behaviour((_goal,), lambda flown, site: flown.distance_m < REACHED_M),
     "home": Behaviour((_goal, _home), _at_home, 240.0),
     "corridor": Behaviour((lambda moment: FollowCorridor(until_s=moment.clock_s + FOLLOWED_S),), _at_an_end, 160.0),
-    "exits": Behaviour((lambda moment: Explore(until_s=moment.clock_s + EXPLORED_S), _home), _at_home, 420.0),
+    "exits": Behaviour((lambda moment: Explore(until_s=moment.clock_s + EXPLORED_S), _home), _at_home, 540.0),
 }
 """By name; ``exits`` explores for `EXPLORED_S` and returns home, and the exits found are scored, too."""
 
