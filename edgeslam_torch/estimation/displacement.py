@@ -17,6 +17,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.sensors.attitude import Headings, UpDirections, headings, up_directions
@@ -91,7 +92,11 @@ class TelemetryModel:
         return self.new_map and not self.metric
 
     def positions(
-        self, stamps_s: FloatArray, p_m: FloatArray, scale_sigma_log: float | None = None
+        self,
+        stamps_s: FloatArray,
+        p_m: FloatArray,
+        scale_sigma_log: float | None = None,
+        guessed: NDArray[np.bool_] | None = None,
     ) -> PositionGaussian | None:
         """Camera positions by telemetry.
 
@@ -100,6 +105,7 @@ class TelemetryModel:
             p_m: Positions in the present map ``(K, 3)`` [map units], for rejecting single measurements that disagree
                 with the rest.
             scale_sigma_log: Standard deviation of the scale's logarithm; the estimate's own if None.
+            guessed: Frames ``(K,)`` on predicted depths, whose map may be wrong by the whole way; none if None.
 
         Returns:
             The Gaussian, or None without telemetry.
@@ -115,7 +121,8 @@ class TelemetryModel:
         if self.height is not None:
             parts.append(heights(self.track, self.height, at_s, per_scale_w, self.T_b_c[:3, 3], self.delay_sigma_s))
         rows = stacked([part for part in parts if part is not None])
-        return None if rows is None else self._gaussian(rows, p_m)
+        guessed = np.zeros(len(stamps_s), dtype=bool) if guessed is None else guessed
+        return None if rows is None else self._gaussian(rows, p_m, guessed)
 
     def up(self, stamps_s: FloatArray) -> UpDirections | None:
         """Gravity in frames at ``stamps_s`` ``(K,)``; None without attitude."""
@@ -136,13 +143,16 @@ class TelemetryModel:
         p_w, gain = self.scale * p_m @ self.R_w_m.T, np.array(self.gain_sigma)
         return displacements(self.track, at_s, per_scale_w, p_w, gain, arm_b, step, self.truncates, self.delay_sigma_s)
 
-    def _gaussian(self, rows: Rows, p_m: FloatArray) -> PositionGaussian:
+    def _gaussian(self, rows: Rows, p_m: FloatArray, guessed: NDArray[np.bool_]) -> PositionGaussian:
         """Marginalise what does not contradict the map, with robust weights of its independent errors, and rotate to
         map axes."""
         D = np.einsum("mkw,wv->mkv", rows.D, self.R_w_m).reshape(len(rows.measured), -1) * self.scale
         residual = D @ p_m.ravel() - rows.measured
         slow = rows.slow + rows.common @ rows.common.T
-        allowed = rows.white + np.square(_BENT * np.minimum(rows.way, np.median(rows.way)))
+        bent = np.where(
+            np.abs(rows.D[:, guessed]).any(axis=(1, 2)), rows.way, _BENT * np.minimum(rows.way, np.median(rows.way))
+        )
+        allowed = rows.white + np.square(bent)
         used = np.flatnonzero(consistent(residual, slow + np.diag(allowed), rows.group))
         D, residual, measured, slow = D[used], residual[used], rows.measured[used], slow[np.ix_(used, used)]
         white, group = rows.white[used], np.unique(rows.group[used], return_inverse=True)[1]
