@@ -115,6 +115,18 @@ def test_velocities_that_jump_bend_no_map(rng, height):
     assert chi2(told, stretched) > 10.0 * told.rows
 
 
+def test_a_motion_after_a_hover_corrects_a_map_on_guessed_depths_that_saw_nothing_of_it(rng):
+    motion = swinging(16.0)
+    T = motion.T_w_c.copy()
+    T[:, :3, 3] = T[0, :3, 3] + np.clip(motion.stamps_s - 12.0, 0.0, None)[:, None] * [0.4, 0.0, 0.0]
+    model, stamps, p = flown(rng, replace(motion, T_w_c=T))
+    still = np.tile(p[:1], (len(p), 1))
+    told = model.positions(stamps, still, guessed=stamps > 12.0)
+    assert told.refused == 0
+    np.testing.assert_allclose(best(told, still) - best(told, still)[0], p - p[0], atol=0.03)
+    assert model.positions(stamps, still).refused > 0, "a map of triangulated points is believed"
+
+
 def test_an_outage_leaves_the_positions_across_it_alone(rng):
     motion = swinging(20.0)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()

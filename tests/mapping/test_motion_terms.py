@@ -361,3 +361,15 @@ def test_an_attitude_between_two_readings_is_as_uncertain_as_what_the_drone_lean
     systematic_deg = [math.degrees(vertical_since(model, first, s).systematic_rad) for s in (1.5, 2.45, 3.5)]
     assert systematic_deg[0] < 0.1 and systematic_deg[2] < 0.1
     assert 2.0 < systematic_deg[1] < 6.0
+
+
+def test_keyframes_that_attitude_contradicts_may_be_moved_by_all_that_sensors_measure(rng, halves, monkeypatch):
+    """The last keyframe leans by four degrees: its displacements are no outliers, whatever the map says."""
+    model, guessed = telemetry_of(rng, halves), []
+    right = TelemetryModel.positions
+    monkeypatch.setattr(TelemetryModel, "positions", lambda *a: guessed.append(a[-1]) or right(*a))
+    motion_factors(model, halves.keyframes, [0] * 6)
+    lean = se3.exp(np.array([0.0, 0.0, 0.0, math.radians(4.0), 0.0, 0.0]))
+    halves.keyframes[5].T_c_w = lean @ halves.keyframes[5].T_c_w
+    motion_factors(model, halves.keyframes, [0] * 6)
+    assert [list(flags) for flags in guessed] == [[False] * 6, [False] * 5 + [True]]
