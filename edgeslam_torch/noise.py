@@ -34,6 +34,8 @@ ATTITUDE_STEP_RAD = math.radians(1.0)
 """Quantisation step of the SDK's attitude: a change by one shows no motion."""
 READING_S = 0.1
 """Between two readings. What the drone leans meanwhile is the error of an attitude interpolated between them."""
+CONTRADICTS = 3.0
+"""Standard deviations of attitude from which on it contradicts the tilt of a pose."""
 FIRST_ATTITUDE_RAD = math.radians(1.0)
 """Of the first attitude, per axis: whole degrees, and the drift since power-on."""
 ATTITUDE_WALK_RAD_SQRT_S = 0.05

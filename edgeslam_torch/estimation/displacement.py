@@ -27,7 +27,7 @@ from edgeslam_torch.estimation.sensors.velocity import displacements
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.gate import consistent
 from edgeslam_torch.geometry.robust_statistics import tukey_weight
-from edgeslam_torch.noise import MOUNT_RAD
+from edgeslam_torch.noise import ATTITUDE_RAD, CONTRADICTS, MOUNT_RAD
 from edgeslam_torch.types import FloatArray
 
 _LEAST_WEIGHT = 1e-4
@@ -131,6 +131,16 @@ class TelemetryModel:
         # Without parallax half a degree of lean looks like motion, and depths diverge.
         steady = not self.metric
         return up_directions(self.track, stamps_s - self.delay_s, self.T_b_c[:3, :3], self.R_w_m, steady)
+
+    def leaning(self, stamps_s: FloatArray, R_c_m: FloatArray) -> NDArray[np.bool_]:
+        """Frames ``(K,)``, rotated ``(K, 3, 3)`` by the map, whose tilt attitude contradicts beside that of most."""
+        leans, up = np.zeros(len(stamps_s), dtype=bool), self.up(stamps_s)
+        if up is not None:
+            up_m = np.einsum("kcm,kc->km", R_c_m[up.frame], up.up_c)
+            most = np.median(up_m, axis=0)
+            off_rad = np.linalg.norm(np.cross(up_m, most / np.linalg.norm(most)), axis=1)
+            leans[up.frame] = off_rad > CONTRADICTS * math.sqrt(2.0) * ATTITUDE_RAD
+        return leans
 
     def headings(self, stamps_s: FloatArray) -> Headings | None:
         """Headings of frames at increasing ``stamps_s`` ``(K,)``; None for fewer than two, or without metric scale."""

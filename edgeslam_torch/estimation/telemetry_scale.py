@@ -20,13 +20,9 @@ from edgeslam_torch.estimation.scale.evidence import (
     turned_since,
 )
 from edgeslam_torch.estimation.sensors.height import floor_segments
-from edgeslam_torch.estimation.sensors.velocity import (
-    Rounding,
-    SeenVelocity,
-    remainder_gain,
-    seen_velocity,
-)
+from edgeslam_torch.estimation.sensors.velocity import SeenVelocity, remainder_gain, seen_velocity
 from edgeslam_torch.estimation.telemetry.alignment import camera_moved, in_common
+from edgeslam_torch.estimation.telemetry.quantisation import Rounding
 from edgeslam_torch.estimation.telemetry.remembered import Remembered
 from edgeslam_torch.estimation.telemetry.sensor_validation import (
     Reading,

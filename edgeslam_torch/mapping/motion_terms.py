@@ -5,13 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgeslam_torch.estimation.acceleration_prior import inertia
 from edgeslam_torch.estimation.displacement import TelemetryModel
-from edgeslam_torch.estimation.sensors.attitude import UpDirections
 from edgeslam_torch.map.keyframe import Keyframe
-from edgeslam_torch.noise import ATTITUDE_RAD, ATTITUDE_STEP_RAD, READING_S
+from edgeslam_torch.noise import ATTITUDE_RAD, ATTITUDE_STEP_RAD, CONTRADICTS, READING_S
 from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
 from edgeslam_torch.types import FloatArray
 
@@ -30,8 +28,6 @@ image, distinguish rotation from translation (docs/decisions/05-first-frame.md).
 GUESSED_IMAGE = 3000.0
 """The same for a single image: more than it has, since it does not measure tilt. A window of several views does, and
 this weight would bend it where the attitude is wrong."""
-SURE = 3.0
-"""Standard deviations from which on a tilt contradicts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +58,7 @@ class Vertical:
     def contradicts(self, T_c_w: FloatArray) -> bool:
         """Whether it contradicts the tilt of a tracked pose ``(4, 4)``: on wrong depths a climb looks like a pitch."""
         sigma_rad = math.hypot(math.sqrt(2.0) * ATTITUDE_RAD, self.systematic_rad)
-        return float(np.linalg.norm(np.cross(T_c_w[:3, :3] @ self.up_w, self.up_c))) > SURE * sigma_rad
+        return float(np.linalg.norm(np.cross(T_c_w[:3, :3] @ self.up_w, self.up_c))) > CONTRADICTS * sigma_rad
 
     def sigma(self, samples: float) -> float:
         """Standard deviation per axis [rad], if this number of correlated reprojections counts as one."""
@@ -112,9 +108,8 @@ def motion_factors(
             continue
         order = np.array(sorted(members, key=lambda i: keyframes[i].stamp_s), dtype=np.int64)
         stamps = np.array([keyframes[i].stamp_s for i in order])
-        up = model.up(stamps)
         guessed = np.array([keyframes[i].tracked is not None for i in order])
-        guessed |= _leaning(up, np.stack([keyframes[i].T_c_w[:3, :3] for i in order]))
+        guessed |= model.leaning(stamps, np.stack([keyframes[i].T_c_w[:3, :3] for i in order]))
         reported = model.positions(stamps, np.stack([keyframes[i].centre_w for i in order]), scale_sigma_log, guessed)
         if reported is not None:
             centres.append(
@@ -128,7 +123,7 @@ def motion_factors(
         inert = inertia(stamps, model.scale) if model.metric else None
         if inert is not None:
             centres.append(CentreFactor(order, effective_samples * inert, np.zeros(len(inert)), 0.0))
-        attitude = max(1.0, ATTITUDE * effective_samples)
+        up, attitude = model.up(stamps), max(1.0, ATTITUDE * effective_samples)
         if up is not None:
             known = max(up.sigma_rad / math.sqrt(attitude), ATTITUDE_RAD)
             sigma_rad = up.sigma_rad / math.sqrt(GUESSED) if model.holds_level else known
@@ -138,14 +133,3 @@ def motion_factors(
             poses = order[heading.frame]
             turned.append(HeadingFactor(poses, heading.R_c_m, heading.up_m, attitude * heading.information))
     return MotionFactors(tuple(centres), tuple(gravity), tuple(turned))
-
-
-def _leaning(up: UpDirections | None, R_c_w: FloatArray) -> NDArray[np.bool_]:
-    """Which of the frames ``(K, 3, 3)`` attitude contradicts, beside the median of the others' tilt."""
-    leans = np.zeros(len(R_c_w), dtype=bool)
-    if up is not None:
-        up_w = np.einsum("kcw,kc->kw", R_c_w[up.frame], up.up_c)
-        middle = np.median(up_w, axis=0)
-        off_rad = np.linalg.norm(np.cross(up_w, middle / np.linalg.norm(middle)), axis=1)
-        leans[up.frame] = off_rad > SURE * math.sqrt(2.0) * ATTITUDE_RAD
-    return leans

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.estimation.sensors.velocity import Rounding, remainder, remainder_gain, seen_velocity
+from edgeslam_torch.estimation.sensors.velocity import remainder_gain, seen_velocity
+from edgeslam_torch.estimation.telemetry.quantisation import Rounding, remainder
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, Sightings
 from edgeslam_torch.geometry.mount import camera_on_body

@@ -12,13 +12,12 @@ gives other remainders: a fixed point, see `remainder_gain`.
 
 import math
 from dataclasses import dataclass
-from enum import StrEnum
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.estimation.sensors.rows import Rows
+from edgeslam_torch.estimation.telemetry.quantisation import Rounding, remainder
 from edgeslam_torch.estimation.telemetry.track import TelemetryTrack, cubic
 from edgeslam_torch.estimation.telemetry.visual_memory import Displacements, Sightings
 from edgeslam_torch.geometry.se3 import hat
@@ -30,44 +29,11 @@ _LASTING, _VARIES_S = 0.25, 1.0
 Over a reading of three seconds the mean error is .01 m/s at varying speed; for a constant speed it would be .029."""
 LONGEST_S = 10.0
 """Maximum time between two positions for integrated velocity."""
-_NOISE_STEPS = 0.4
-"""Noise of a velocity before quantisation [steps]: 0.02 to 0.03 m/s of the sensor, and 0.03 to 0.04 m/s of vision over
-a tenth of a second."""
 _HALF_S = 0.05
 """Half the averaging time of one reading."""
-_FEW_STEPS, _FINE = 4.0, 0.02
-"""Speed above which the remainder is constant, and resolution of the grid below [steps]."""
 _MOST_GAIN = 0.9
 _PROBE = 0.05
 """Relative change of the scale for the numeric derivative."""
-
-
-class Rounding(StrEnum):
-    """Quantisation mode of a velocity."""
-
-    NEAREST = "nearest"
-    TRUNCATE = "truncate"
-
-
-@lru_cache(maxsize=2)
-def _table(rounding: Rounding) -> tuple[FloatArray, FloatArray]:
-    """Speeds from 0 up, and the expected remainder at each [steps]."""
-    speed = np.arange(0.0, _FEW_STEPS + 0.5 * _FINE, _FINE)
-    first = 1.0 if rounding is Rounding.TRUNCATE else 0.5
-    edges = first + np.arange(_FEW_STEPS + 4.0)
-
-    def passed(x: FloatArray) -> FloatArray:
-        """Expected number of quantisation thresholds below ``x`` plus noise."""
-        z = (x[:, None] - edges) / (_NOISE_STEPS * math.sqrt(2.0))
-        return np.array([[0.5 * math.erfc(-v) for v in row] for row in z.tolist()]).sum(axis=1)
-
-    return speed, speed - (passed(speed) - passed(-speed))
-
-
-def remainder(velocity_steps: FloatArray, rounding: Rounding) -> FloatArray:
-    """Expected true minus reported velocity [steps], for true velocities [steps] of any shape."""
-    speed, lost = _table(rounding)
-    return np.asarray(np.sign(velocity_steps) * np.interp(np.abs(velocity_steps), speed, lost))
 
 
 @dataclass(frozen=True, slots=True)

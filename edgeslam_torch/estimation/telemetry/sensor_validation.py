@@ -13,7 +13,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.estimation.sensors.velocity import Rounding, remainder
+from edgeslam_torch.estimation.telemetry.quantisation import Rounding, remainder
 from edgeslam_torch.estimation.telemetry.track import Turn
 from edgeslam_torch.geometry.robust_statistics import median
 from edgeslam_torch.types import FloatArray, IntArray
