@@ -78,6 +78,8 @@ class TelemetryModel:
     """Whether the map is only seconds old."""
     mount_sigma_rad: float = MOUNT_RAD
     """Standard deviation per axis of the camera's mount."""
+    turns: bool = True
+    """Whether the images have validated attitude."""
     gain_sigma: tuple[float, ...] = (0.0, 0.0, 0.0)
     """Relative standard deviation of each velocity column, beyond that of the scale."""
 

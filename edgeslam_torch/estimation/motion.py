@@ -362,6 +362,7 @@ class MotionFusion:
             self.metres.fit.truncates,
             self._trust.attitude,
             mount_sigma_rad=MOUNT_RAD if orientation.found is None else float(orientation.found.sigma_rad[:2].max()),
+            turns=self._trust.turns,
             gain_sigma=self._trust.gain_sigma,
         )
 

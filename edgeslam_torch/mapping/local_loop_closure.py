@@ -20,7 +20,7 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
-NEAR_PX, FAR_PX = 5.0, 30.0
+NEAR_PX, FAR_PX = 10.0, 30.0
 """Search radius at pyramid level 0 for a camera that has hardly moved in between, and the largest: 3 degrees at 525 px,
 drift of 6 % of the depth. In between, what the way allows: on wallpaper, the next repetition fits as well."""
 SURE = 3.0

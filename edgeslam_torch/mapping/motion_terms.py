@@ -77,7 +77,8 @@ def vertical_since(model: TelemetryModel | None, reference: Keyframe, stamp_s: f
     at_s = stamps_s - model.delay_s
     turned = float(np.diff(model.track.yaw(at_s))[0])
     mount_rad = 2.0 * abs(math.sin(0.5 * turned)) * model.mount_sigma_rad
-    between_rad = np.maximum(model.track.leaned(at_s, READING_S) - ATTITUDE_STEP_RAD, 0.0)
+    # An attitude that is not validated holds every frame: where it is wrong, the images contradict it the sooner.
+    between_rad = np.maximum(model.track.leaned(at_s, READING_S) - ATTITUDE_STEP_RAD, 0.0) * model.turns
     systematic_rad = math.hypot(mount_rad, *between_rad)
     return Vertical(up.up_c[1], reference.T_w_c[:3, :3] @ up.up_c[0], up.sigma_rad, model.holds_level, systematic_rad)
 
