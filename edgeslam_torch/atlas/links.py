@@ -90,9 +90,10 @@ class Link:
         by_image = np.hypot(self.sigma_log, PLACE_LOG)
         both, measured = by_image**2 + sigma_log**2, np.log(sim3.scale_of(self.S))
         share = sigma_log**2 / both if passes(np.array([measured]), np.array([[both]])) else 0.0
+        sigma = sigma_log * np.sqrt(1.0 - share)
         change, centre = np.exp((share - 1.0) * measured), self.keyframe.centre_w
         S = self.S @ sim3.compose(change, np.eye(3), (1.0 - change) * centre)
-        return replace(self, S=S, sigma_log=float(sigma_log * by_image / np.sqrt(both)))
+        return replace(self, S=S, sigma_log=float(sigma))
 
 
 def view_of(keyframe: Keyframe, scale_factor: float) -> View:

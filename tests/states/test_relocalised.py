@@ -157,6 +157,8 @@ def test_a_link_does_not_double_a_submap_whose_unit_sensors_have_measured(betwee
     if scale is not None:
         found = Link(camera, flown.keyframes[0], S, 0.02, none, none, 2.0).in_unit(belief.sigma_log)
         assert sim3.scale_of(found.S) == pytest.approx(scale, rel=0.02)
+        # What counts makes the scale surer; what contradicts does not.
+        assert (found.sigma_log < belief.sigma_log) == (scale != 1.0)
         there = (sim3.moved_camera(x, se3.inverse(placed(5.0))) for x in (S, found.S))
         np.testing.assert_allclose(*there, atol=1e-9)
 
