@@ -107,7 +107,8 @@ class TelemetryModel:
             p_m: Positions in the present map ``(K, 3)`` [map units], for rejecting single measurements that disagree
                 with the rest.
             scale_sigma_log: Standard deviation of the scale's logarithm; the estimate's own if None.
-            guessed: Frames ``(K,)`` on predicted depths, whose map may be wrong by the whole way; none if None.
+            guessed: Frames ``(K,)`` on predicted depths, or whose tilt attitude contradicts: there the map may be wrong
+                by the whole way, and no reading is an outlier beside it. None if None.
 
         Returns:
             The Gaussian, or None without telemetry.
@@ -135,7 +136,12 @@ class TelemetryModel:
         return up_directions(self.track, stamps_s - self.delay_s, self.T_b_c[:3, :3], self.R_w_m, steady)
 
     def leaning(self, stamps_s: FloatArray, R_c_m: FloatArray) -> NDArray[np.bool_]:
-        """Frames ``(K,)``, rotated ``(K, 3, 3)`` by the map, whose tilt attitude contradicts beside that of most."""
+        """Which of the frames ``(K,)`` at ``stamps_s`` lean, by attitude, other than most of them.
+
+        Args:
+            stamps_s: Stamps ``(K,)`` [s].
+            R_c_m: Map to camera ``(K, 3, 3)`` as the map has it.
+        """
         leans, up = np.zeros(len(stamps_s), dtype=bool), self.up(stamps_s)
         if up is not None:
             up_m = np.einsum("kcm,kc->km", R_c_m[up.frame], up.up_c)

@@ -38,8 +38,8 @@ _PLACED_M = 0.3
 MAX_VIEWS = 240
 """Views stored to rebuild the grid after a map correction: 24 m of flight at top speed."""
 _LAST_M = 1.0
-"""Way flown that is kept where all else is forgotten: cells nearer than 0.6 m are below and above the picture, and dead
-reckoning over a metre errs by less than the hull."""
+"""Way flown that is kept where all else is forgotten: cells nearer than 0.6 m are below and above the picture. The
+way may be off by what the submaps are, so that obstacles in view count all the same."""
 _MAX_FLOWN = 4000
 """Points of the path flown that are kept: more than four minutes at 15 Hz."""
 _SAME_M, _SAME_COS, _MAX_SAME = 0.1, np.cos(np.radians(4.0)), 3
