@@ -85,8 +85,8 @@ class MotionFusion:
         map's. `MapMerging` resets it."""
         self._begun: VisualPose | None = None
         """Newest pose of the submap that began last, before its first tracked frame."""
-        self._fitted_s = -math.inf
-        """Stamp of the last fit."""
+        self._fitted_s = self._known_s = -math.inf
+        """Stamps of the last fit, and of the last one that determined the scale."""
         self._counts: Counter[str] = Counter()
 
     # --- input ---------------------------------------------------------------------------------------------------
@@ -201,6 +201,17 @@ class MotionFusion:
         if self._memory.last is not None:
             self.imu.begin_submap(self._memory.last.stamp_s)
         self._memory.interrupt()
+        self._memory.part(stamp_s)
+
+    @property
+    def is_apart(self) -> bool:
+        """Whether the camera's submap is not joined to the map before it."""
+        return math.isfinite(self._memory.apart_s)
+
+    def join(self, returned: bool = False) -> None:
+        """The newest submap is joined to the map before it, or the camera has ``returned`` to that."""
+        self.submap = None
+        self._memory.join(returned)
 
     def follow_start(self, stamp_s: float, T_w_c: FloatArray) -> None:
         """A frame's pose ``(4, 4)`` in a submap that has no map yet: no measurement, but where the camera is."""
@@ -384,8 +395,9 @@ class MotionFusion:
         known = self.metres.sensor_scale is not None and math.isfinite(self.flight.delay_sigma_s)
         first_s = _REFIT_S if known else _FIRST_FIT_S
         began = self.submap is not None and not self.submap.is_known
-        grown_s = 0.0 if began else _REFIT_SHARE * min(self._memory.length_s, WINDOW_S)
-        pause_s = max(first_s, grown_s)
+        # A scale that the last fit did not determine is looked for again soon, and ever more rarely.
+        grown_s = _REFIT_SHARE * min(self._memory.length_s, WINDOW_S, math.inf if known else stamp_s - self._known_s)
+        pause_s = first_s if began else max(first_s, grown_s)
         return len(self._track) > 0 and (self.orientation.found is None or stamp_s - self._fitted_s >= pause_s)
 
     def _refit(self, flying: bool = True) -> None:
@@ -412,6 +424,8 @@ class MotionFusion:
             return
         scale = TelemetryScale(self.flight, T_b_c, turned, rough, metres.network(), metres.previous_scale(), flying)
         metres.take(*scale.beliefs(), self._trust)
+        if metres.sensor_scale is not None:
+            self._known_s = last.stamp_s
 
     def _search_delay(self) -> None:
         guessed = not math.isfinite(self.flight.delay_sigma_s)

@@ -12,6 +12,7 @@ from edgeslam_torch.estimation.config import FusionConfig
 from edgeslam_torch.estimation.motion import MotionFusion
 from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.estimation.snapshot import Present
+from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
 
@@ -47,8 +48,9 @@ class Flown:
         return self
 
     def fly_on(self, until_s, leap=None, size=1.0):
-        """After 15 s, in a map that is moved by ``leap`` or is of another ``size``."""
-        for i in np.flatnonzero((self.motion.stamps_s > 15.0) & (self.motion.stamps_s < until_s)):
+        """On from the last frame, in a map that is moved by ``leap`` or is of another ``size``."""
+        from_s = max(15.0, self.fusion.flight.memory.last.stamp_s)
+        for i in np.flatnonzero((self.motion.stamps_s > from_s) & (self.motion.stamps_s < until_s)):
             t, gauge = float(self.motion.stamps_s[i]), self.gauge
             self.fusion.add_telemetry([s for s in self.samples if t - 0.05 < s.stamp_s <= t])
             T_m_c = gauge.T_m_c[i].copy() if leap is None else leap @ gauge.T_m_c[i]
@@ -154,9 +156,33 @@ def test_a_new_piece_of_map_has_a_scale_of_its_own(flown, size):
     flown.fly_on(20.0, size=size)
     assert flown.fusion.submap.is_known
     assert flown.fusion.submap.growth == pytest.approx(1.0 / size, rel=0.05)
-    flown.fusion.submap = None
+    flown.fusion.join(returned=True)
     assert flown.fusion.scale() == before
     assert flown.fusion.health(20.0, "tracking", True).scale == before
+
+
+def test_attitude_is_not_blamed_for_the_heading_at_which_a_piece_begins(flown):
+    """It was predicted while nothing was tracked; sensors measure the piece all the same."""
+    T_m_w, memory = flown.gauge.T_m_w, flown.fusion.flight.memory
+    turned = T_m_w @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.6])) @ se3.inverse(T_m_w)
+    flown.fusion.begin_piece(*predicted_at(flown, 15.1))
+    flown.fly_on(20.0, turned, size=2.0)
+    assert flown.fusion.flight.trust.turns and flown.fusion.is_apart
+    assert flown.fusion.submap.growth == pytest.approx(0.5, rel=0.05)
+    flown.fusion.join(returned=True)
+    assert not flown.fusion.is_apart and memory.newest().stamps_s[-1] < 15.1, "none of it is of the map before"
+
+
+def test_a_scale_that_one_fit_did_not_determine_is_looked_for_again_soon(flown, monkeypatch):
+    """The longer the flight, the rarer are fits: this one would hover for a tenth of its time without metres."""
+    flown.fly_on(17.0)
+    fit, results = TelemetryScale.beliefs, [({}, None)]
+    monkeypatch.setattr(TelemetryScale, "beliefs", lambda self: results.pop() if results else fit(self))
+    known = [flown.fusion.metres.sensor_scale is not None]
+    for until_s in np.arange(17.0, 20.0, 0.1):
+        flown.fly_on(float(until_s))
+        known.append(flown.fusion.metres.sensor_scale is not None)
+    assert known[0] and known[-1] and 0 < np.sum(~np.array(known)) < 12
 
 
 def test_a_piece_that_begins_in_a_new_one_is_of_the_same_map(flown):

@@ -61,6 +61,9 @@ def system_of(pieces, motion, busy=False):
     remembered = []
     fusion = SimpleNamespace(
         submap=None,
+        is_apart=False,
+        joined=[],
+        join=lambda returned=False: fusion.joined.append(returned),
         revise=lambda *poses: revised.append(poses),
         revised=revised,
         scale=lambda: ScaleEstimate(2.0, 0.02, "telemetry"),
@@ -168,7 +171,7 @@ def scaling(rng, monkeypatch, piece, measured, sigma=0.03):
     atlas.is_up_to_date, atlas.edges = True, None
     before = ScaleBelief(0.3, 0.02, "telemetry")
     found = ScaleBelief(0.3 + np.log(measured), sigma, "height")
-    system.fusion.submap = SubmapScale(0.0, before, found)
+    system.fusion.submap, system.fusion.is_apart = SubmapScale(0.0, before, found), True
 
     def move(slam_map, edges, log, S):
         moved.append(S)
@@ -201,11 +204,12 @@ def test_a_submap_measured_as_well_as_the_map_is_of_one_unit_with_it(rng, monkey
 
 
 @pytest.mark.parametrize(
-    ("piece", "measured", "sigma", "settled"),
+    ("piece", "measured", "sigma", "returned"),
     [(1, 0.97, 0.03, False), (1, 0.5, 0.2, False), (0, 0.5, 0.03, True)],
     ids=["of the map's unit", "not yet known", "back in the first submap"],
 )
-def test_other_submaps_stay(rng, monkeypatch, piece, measured, sigma, settled):
+def test_other_submaps_stay(rng, monkeypatch, piece, measured, sigma, returned):
     system, moved, _, (before, after) = scaling(rng, monkeypatch, piece, measured, sigma)
     np.testing.assert_array_equal(before, after)
-    assert not moved and (system.fusion.submap is None) == settled
+    assert not moved and system.fusion.submap is not None
+    assert system.fusion.joined == ([True] if returned else [])

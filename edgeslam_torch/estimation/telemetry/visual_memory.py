@@ -122,6 +122,8 @@ class VisualMemory:
         self._interrupted = True
         self.began_s = math.inf
         """Stamp of the first tracked frame."""
+        self.apart_s = -math.inf
+        """Stamp from which on poses are of a submap that is not joined to the map before it."""
         self.last: VisualPose | None = None
         """Newest tracked frame."""
         self.previous: VisualPose | None = None
@@ -149,6 +151,19 @@ class VisualMemory:
         other._unbroken = deque((self._unbroken[k] and k > kept[0] for k in kept), self._unbroken.maxlen)
         other._shown = other._displacements = None
         return other
+
+    def part(self, stamp_s: float) -> None:
+        """Poses from a stamp on are those of a submap whose heading in the map is unknown until both are joined."""
+        self.apart_s = stamp_s
+
+    def join(self, returned: bool = False) -> None:
+        """All poses are of one map again; those of a submap that was left to return to the map before it are not."""
+        if returned:
+            kept = [(v, u) for v, u in zip(self._sightings, self._unbroken, strict=True) if v.stamp_s < self.apart_s]
+            self._sightings = deque((v for v, _ in kept), self._sightings.maxlen)
+            self._unbroken = deque((u for _, u in kept), self._unbroken.maxlen)
+            self._interrupted, self._shown, self._displacements = True, None, None
+        self.apart_s = -math.inf
 
     def interrupt(self) -> None:
         """End the current displacement: tracking was lost."""
@@ -193,9 +208,9 @@ class VisualMemory:
             self._displacements = Displacements(seen.stamps_s[i], seen.stamps_s[j], moved, sigma, R[i], R[j])
         return self._displacements
 
-    def newest(self, count: int) -> Sightings:
-        """At most ``count`` newest poses in order, as arrays."""
-        return _arrays(list(islice(reversed(self._sightings), count))[::-1])
+    def newest(self, count: int | None = None) -> Sightings:
+        """The newest poses of the present submap in order, at most ``count``, as arrays."""
+        return _arrays([v for v in islice(reversed(self._sightings), count) if v.stamp_s >= self.apart_s][::-1])
 
     def sightings(self) -> Sightings:
         """All poses as arrays."""
