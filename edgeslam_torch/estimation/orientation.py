@@ -93,7 +93,7 @@ class Orientation:
         if self.found is None or self.upright() is None:
             return None
         flight = self._flight
-        at_s = flight.memory.newest().stamps_s - flight.delay_s
+        at_s = flight.memory.sightings().stamps_s - flight.delay_s
         leaned = float(np.median(flight.track.leaned(at_s, min(flight.delay_sigma_s, DELAY_S))))
         return self.found.R_w_m[2], math.hypot(float(self.found.sigma_rad[:2].max()), leaned)
 

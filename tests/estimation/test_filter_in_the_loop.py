@@ -165,7 +165,10 @@ def test_attitude_is_not_blamed_for_the_heading_at_which_a_piece_begins(flown):
     """It was predicted while nothing was tracked; sensors measure the piece all the same."""
     T_m_w, memory = flown.gauge.T_m_w, flown.fusion.flight.memory
     turned = T_m_w @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.6])) @ se3.inverse(T_m_w)
+    before = flown.fusion.up()
     flown.fusion.begin_piece(*predicted_at(flown, 15.1))
+    np.testing.assert_array_equal(flown.fusion.up().direction, before.direction)
+    assert flown.fusion.up().sigma_rad == before.sigma_rad, "without a pose in the piece"
     flown.fly_on(20.0, turned, size=2.0)
     assert flown.fusion.flight.trust.turns and flown.fusion.is_apart
     assert flown.fusion.submap.growth == pytest.approx(0.5, rel=0.05)
