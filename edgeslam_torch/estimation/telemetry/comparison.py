@@ -159,9 +159,9 @@ class Comparison:
         known, flight = math.isfinite(delay.sigma_s), self._flight
         low, high = flight.config.delay_range_s
         delays_s = [delay.value_s] if known else np.arange(low, high + 1e-9, _DELAY_STEP_S).tolist()
-        ratios = []
+        ratios, seen = [], flight.memory.newest()
         for delay_s in delays_s:
-            reported = attitudes(flight.memory.newest(), flight.track, delay_s)
+            reported = attitudes(seen, flight.track, delay_s)
             if reported is not None and len(reported.stamp_s) >= _FEW_ATTITUDES:
                 ratios.append(
                     self._relative_deviation(reported, self._T_b_c[:3, :3], delay.sigma_s if known else _DELAY_STEP_S)
