@@ -80,9 +80,9 @@ class MotionFusion:
         """The newest state message."""
         self._comparison = Comparison(self.flight)
         self._filter = FilterFeed(config, given)
-        self.submap: SubmapScale | None = None
-        """Scale of a submap that began on predicted depths; None once it is joined to another, or as well known as the
-        map's. `MapMerging` resets it."""
+        self.submaps: dict[int, SubmapScale] = {}
+        """Scales of submaps that began on predicted depths, by their numbers; none of one that is joined to another, or
+        as well known as the map's. `MapMerging` removes those."""
         self._begun: VisualPose | None = None
         """Newest pose of the submap that began last, before its first tracked frame."""
         self._fitted_s = self._known_s = -math.inf
@@ -127,7 +127,7 @@ class MotionFusion:
         if last is not None and stamp_s <= last.stamp_s:
             self._counts["visual out of order"] += 1
             return
-        visual = VisualPose(stamp_s, np.array(T_w_c, dtype=np.float64), sigma_t, sigma_r_rad)
+        visual = VisualPose(stamp_s, np.array(T_w_c, dtype=np.float64), sigma_t, sigma_r_rad, self._memory.piece)
         self._memory.add(visual)
         if self._is_due(stamp_s) or (stamp_s - self._fitted_s >= _FIRST_FIT_S and self.orientation.has_diverged()):
             self._remember_refined(stamp_s, WINDOW_S)
@@ -153,7 +153,7 @@ class MotionFusion:
         for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
             last = self._memory.last
             if np.isfinite(T).all() and (last is None or stamp_s > last.stamp_s):
-                self._memory.add(VisualPose(stamp_s, T, sigma_t, sigma_r_rad))
+                self._memory.add(VisualPose(stamp_s, T, sigma_t, sigma_r_rad, self._memory.piece))
         self._fit_imu()
 
     def revise(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
@@ -189,29 +189,43 @@ class MotionFusion:
         if (seen := self._filter.seen) is not None:
             self._filter.move_map(seen.moved(T))
 
-    def begin_piece(self, stamp_s: float, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
+    def begin_piece(self, piece: int, stamp_s: float, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
         """Begin a submap at a predicted pose: the step between submaps is no motion of the camera.
 
-        The submap has a scale of its own, by predicted depths, which sensors measure. Arguments as for `add_visual`.
+        The submap has a scale and a heading of its own, by predicted depths and motion, which sensors measure.
+        Arguments as for `add_visual`, and the submap's number.
         """
-        self._begun = VisualPose(stamp_s, T_w_c, sigma_t, sigma_r_rad)
+        self._begun = VisualPose(stamp_s, T_w_c, sigma_t, sigma_r_rad, piece)
         before = self.metres.sensor_scale if self.submap is None else self.submap.before
-        self.submap = None if before is None else SubmapScale(stamp_s, before)
-        self._filter.clear()
-        if self._memory.last is not None:
-            self.imu.begin_submap(self._memory.last.stamp_s)
+        self.enter(piece)
         self._memory.interrupt()
-        self._memory.part(stamp_s)
+        if before is not None:
+            self.submaps[piece] = SubmapScale(before)
 
     @property
-    def is_apart(self) -> bool:
-        """Whether the camera's submap is not joined to the map before it."""
-        return math.isfinite(self._memory.apart_s)
+    def submap(self) -> SubmapScale | None:
+        """Scale of the camera's submap, if it is not the map's."""
+        return self.submaps.get(self._memory.piece)
 
-    def join(self, returned: bool = False) -> None:
-        """The newest submap is joined to the map before it, or the camera has ``returned`` to that."""
-        self.submap = None
-        self._memory.join(returned)
+    def enter(self, piece: int) -> None:
+        """The camera is in a submap from now on, by its number: a new one, or one that it has returned to."""
+        if piece != self._memory.piece:
+            self._filter.clear()
+            if self._memory.last is not None:
+                self.imu.begin_submap(self._memory.last.stamp_s)
+            self._memory.enter(piece)
+            self._fitted_s = -math.inf
+
+    def join(self, piece_of: Callable[[int], int]) -> None:
+        """Submaps were merged: ``piece_of`` returns the present number of each. The whole is of the map's unit if one
+        of them was."""
+        of_one_unit = {piece_of(piece) for piece in self._memory.pieces - self.submaps.keys()}
+        self.submaps = {
+            piece: known
+            for piece, known in self.submaps.items()
+            if piece_of(piece) == piece and piece not in of_one_unit
+        }
+        self._memory.join(piece_of)
 
     def follow_start(self, stamp_s: float, T_w_c: FloatArray) -> None:
         """A frame's pose ``(4, 4)`` in a submap that has no map yet: no measurement, but where the camera is."""
@@ -256,7 +270,7 @@ class MotionFusion:
     @property
     def has_unit(self) -> bool:
         """Whether velocities or heights have measured the map's unit, to which later submaps are brought."""
-        return self.submap is not None or self.metres.sensor_scale is not None
+        return len(self.submaps) > 0 or self.metres.sensor_scale is not None
 
     def up(self) -> Up | None:
         """The vertical in the map, by the IMU or by an attitude that the images do not contradict."""
@@ -413,16 +427,21 @@ class MotionFusion:
         if turned is None:
             return
         orientation.found = turned
+        if self._trust.turns:
+            self._memory.R_w_piece[self._memory.piece] = turned.R_w_m
         T_b_c, rough = orientation.T_b_c, metres.rough()
         self._comparison.judge(T_b_c, turned.R_w_m, rough, flying)
-        if self.submap is not None:  # what it measures says nothing of the map before it
-            own = replace(self.flight, memory=self._memory.since(self.submap.since_s), trust=deepcopy(self._trust))
+        piece = self._memory.piece
+        if piece in self.submaps:  # what it measures says nothing of the map before it
+            own = replace(self.flight, memory=self._memory.of({piece}), trust=deepcopy(self._trust))
             if len(own.memory.sightings().stamps_s) > 0:
                 found, _ = TelemetryScale(own, T_b_c, turned, rough, None, None, flying).beliefs()
                 if found is not None:
-                    self.submap = replace(self.submap, measured=mean(list(found.values())))
+                    self.submaps[piece] = replace(self.submaps[piece], measured=mean(list(found.values())))
             return
-        scale = TelemetryScale(self.flight, T_b_c, turned, rough, metres.network(), metres.previous_scale(), flying)
+        of_one_unit = self._memory.of(self._memory.pieces - self.submaps.keys()) if self.submaps else self._memory
+        flight = replace(self.flight, memory=of_one_unit)
+        scale = TelemetryScale(flight, T_b_c, turned, rough, metres.network(), metres.previous_scale(), flying)
         metres.take(*scale.beliefs(), self._trust)
         if metres.sensor_scale is not None:
             self._known_s = last.stamp_s

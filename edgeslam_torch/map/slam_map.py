@@ -89,7 +89,10 @@ class SlamMap:
 
     def piece_of(self, keyframe_id: int) -> int:
         """Number of the present submap of a keyframe, alive or removed."""
-        piece = self._piece[keyframe_id]
+        return self.whole(self._piece[keyframe_id])
+
+    def whole(self, piece: int) -> int:
+        """Number of the submap that a submap is part of now: its own, or of the one that it was merged with."""
         while piece in self._joined:
             piece = self._joined[piece]
         return piece

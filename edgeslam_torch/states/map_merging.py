@@ -26,8 +26,8 @@ class MapMerging:
         system, changes = self.system, []
         if system.mapping.busy or not system.log.records:
             return ""
-        if system.fusion.is_apart:
-            self._compare_submap()
+        if system.fusion.submap is not None:
+            self._scale_submap(system.fusion.submap)
         while not self.atlas.is_up_to_date and (found := self._followed()):
             changes.append(found)
         return "; ".join(map(str, changes))
@@ -53,30 +53,27 @@ class MapMerging:
         if self.atlas.is_divided:
             self.atlas.search_all_again()
         self.update()
-        self.system.fusion.join()  # the result is the largest whole
+        largest = self.system.log.support().largest()
+        if largest is not None:  # the result
+            self.system.fusion.enter(largest)
+            self.system.fusion.submaps.pop(largest, None)
 
-    def _compare_submap(self) -> None:
-        """Follow the camera's return from a submap to the map before it, or the submap's scale."""
-        system = self.system
-        piece = system.map.piece_of(system.log.records[-1].keyframe_id)
-        starts = self.atlas.graph.starts
-        start = starts.get(piece)
-        if start is None or start.keyframe_id != max(s.keyframe_id for s in starts.values()):
-            system.fusion.join(returned=True)
-        elif system.fusion.submap is not None:
-            self._scale_submap(system.fusion.submap, piece, start.keyframe_id)
-
-    def _scale_submap(self, known: SubmapScale, piece: int, first: int) -> None:
-        """Bring a submap to the map's unit, about the place where it began, whenever sensors contradict that it is: a
-        change of the unit instead would move that place, where the map before it had the camera."""
-        system, last = self.system, self.system.log.records[-1].keyframe_id
-        growth = known.growth
+    def _scale_submap(self, known: SubmapScale) -> None:
+        """Bring the camera's submap to the map's unit, about the place where it began, whenever sensors contradict that
+        it is: a change of the unit instead would move that place, where the map before it had the camera."""
+        system, last, growth = self.system, self.system.log.records[-1].keyframe_id, known.growth
+        piece = system.map.piece_of(last)
+        start = self.atlas.graph.starts.get(piece)
+        if start is None:
+            return
         # Growth counts once, also if the sensors cannot measure the grown submap again.
-        system.fusion.submap = None if known.is_settled else known.grown()
+        system.fusion.submaps[piece] = known.grown()
+        if known.is_settled:
+            del system.fusion.submaps[piece]
         if growth == 1.0:
             return
         T_c_k = system.motion.T_c_w @ se3.inverse(system.map.pose_of(last))
-        began = se3.inverse(system.map.pose_of(first))[:3, 3]
+        began = se3.inverse(system.map.pose_of(start.keyframe_id))[:3, 3]
         S = sim3.compose(growth, np.eye(3), (1.0 - growth) * began)
         members = [id for id in system.map.keyframes if system.map.piece_of(id) == piece]
         self._follow(last, T_c_k, move(system.map, self.atlas.edges, system.log, dict.fromkeys(members, S))[last])
@@ -90,7 +87,7 @@ class MapMerging:
         change = self.atlas.update()
         if change is None:
             return None
-        system.fusion.join()
+        system.fusion.join(system.map.whole)
         self._follow(last, T_c_k, change.growth(last))
         system.events[change.kind] = system.events.get(change.kind, 0) + 1
         return change

@@ -125,8 +125,9 @@ class System:
         metre = 1.0 / self.published.scale if self.mapping.has_metres else None
         return reach_after(stamp_s - self.motion.seen_s, T_predicted, metre)
 
-    def see(self, stamp_s: float, track: Track) -> None:
+    def see(self, stamp_s: float, track: Track, reference: Keyframe) -> None:
         """Pass the visual pose to the fusion, and publish the resulting scale."""
+        self.fusion.enter(self.map.piece_of(reference.id))
         if self.shows_nothing_new:
             return
         T_w_c = se3.inverse(track.T_c_w)
@@ -164,7 +165,7 @@ class System:
         predicted = self.fusion.predict(keyframe.stamp_s)
         sigma = (np.inf, np.inf) if predicted is None else (predicted.sigma_t, predicted.sigma_r_rad)
         self.graph.begin(self.map.piece, keyframe, *sigma, one_unit=self.fusion.has_unit)
-        self.fusion.begin_piece(keyframe.stamp_s, keyframe.T_w_c, *sigma)
+        self.fusion.begin_piece(self.map.piece, keyframe.stamp_s, keyframe.T_w_c, *sigma)
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 

@@ -158,7 +158,7 @@ class Tracking:
         system.motion.move(frame.stamp_s, track.T_c_w)
         self.relocaliser.forget()
         self._recent = track.anchor if track.inliers else self._recent
-        system.see(frame.stamp_s, track)
+        system.see(frame.stamp_s, track, reference)
         before = system.log.relative_to_last(track.T_c_w)
         due = located.due and (_leans(expected, track) or not self._adds_nothing(frame.stamp_s, located))
         keyframe = self._insert_keyframe(frame, seen, located) if due else None

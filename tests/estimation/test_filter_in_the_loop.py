@@ -14,6 +14,7 @@ from edgeslam_torch.estimation.output_frame import OutputFrame
 from edgeslam_torch.estimation.snapshot import Present
 from edgeslam_torch.estimation.telemetry_scale import TelemetryScale
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import rotation_vector
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
 
 DELAY_S = 0.4
@@ -122,9 +123,9 @@ def test_a_map_that_is_moved_moves_the_prediction_along(flown):
 
 
 def predicted_at(flown, stamp_s):
-    """Where a submap begins: the filter's pose and its sigmas."""
+    """Where submap 1 begins: the filter's pose and its sigmas."""
     predicted = flown.fusion.predict(stamp_s)
-    return stamp_s, predicted.T_w_c, predicted.sigma_t, predicted.sigma_r_rad
+    return 1, stamp_s, predicted.T_w_c, predicted.sigma_t, predicted.sigma_r_rad
 
 
 def test_the_present_of_a_new_piece_of_map_is_where_it_begins(flown):
@@ -132,11 +133,11 @@ def test_the_present_of_a_new_piece_of_map_is_where_it_begins(flown):
     begun = predicted_at(flown, 15.3)
     flown.fusion.begin_piece(*begun)
     for at_s in (15.3, 15.4):
-        T_w_c = begun[1] @ se3.exp(np.array([at_s - 15.0, 0.0, 0.0, 0.0, at_s - 15.0, 0.0]))
+        T_w_c = begun[2] @ se3.exp(np.array([at_s - 15.0, 0.0, 0.0, 0.0, at_s - 15.0, 0.0]))
         flown.fusion.follow_start(at_s, T_w_c)
         now = Present(flown.fusion.snapshot()).pose_at(at_s + 0.05)
         np.testing.assert_allclose(now.T_w_c, T_w_c, atol=1e-9)
-        assert now.covariance[0, 0] >= begun[2] ** 2 and now.seen_s == at_s
+        assert now.covariance[0, 0] >= begun[3] ** 2 and now.seen_s == at_s
         np.testing.assert_allclose(flown.fusion.begun.T_w_c, T_w_c, atol=1e-9)
     flown.fly_on(18.0)
     assert flown.fusion.begun is None, "it has a map, or the camera is back in an earlier one"
@@ -156,24 +157,54 @@ def test_a_new_piece_of_map_has_a_scale_of_its_own(flown, size):
     flown.fly_on(20.0, size=size)
     assert flown.fusion.submap.is_known
     assert flown.fusion.submap.growth == pytest.approx(1.0 / size, rel=0.05)
-    flown.fusion.join(returned=True)
+    flown.fusion.enter(0)
     assert flown.fusion.scale() == before
     assert flown.fusion.health(20.0, "tracking", True).scale == before
 
 
 def test_attitude_is_not_blamed_for_the_heading_at_which_a_piece_begins(flown):
     """It was predicted while nothing was tracked; sensors measure the piece all the same."""
-    T_m_w, memory = flown.gauge.T_m_w, flown.fusion.flight.memory
+    T_m_w = flown.gauge.T_m_w
     turned = T_m_w @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.6])) @ se3.inverse(T_m_w)
     before = flown.fusion.up()
     flown.fusion.begin_piece(*predicted_at(flown, 15.1))
     np.testing.assert_array_equal(flown.fusion.up().direction, before.direction)
     assert flown.fusion.up().sigma_rad == before.sigma_rad, "without a pose in the piece"
     flown.fly_on(20.0, turned, size=2.0)
-    assert flown.fusion.flight.trust.turns and flown.fusion.is_apart
+    assert flown.fusion.flight.trust.turns
     assert flown.fusion.submap.growth == pytest.approx(0.5, rel=0.05)
-    flown.fusion.join(returned=True)
-    assert not flown.fusion.is_apart and memory.newest().stamps_s[-1] < 15.1, "none of it is of the map before"
+
+
+def test_the_camera_may_return_to_a_piece_and_leave_it_again(flown):
+    """Each keeps its heading, and a scale that is uncertain until sensors have measured it."""
+    T_m_w = flown.gauge.T_m_w
+    turned = T_m_w @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.6])) @ se3.inverse(T_m_w)
+    fusion, before, begun = flown.fusion, flown.fusion.scale(), predicted_at(flown, 15.1)
+    fusion.begin_piece(*begun)
+    flown.fly_on(15.5, turned)
+    fusion.begin_piece(2, 15.5, *begun[2:])
+    flown.fly_on(15.9, size=1.5)
+    for piece, leap in ((0, None), (1, turned), (2, None), (0, None)):
+        fusion.enter(piece)
+        uncertain = fusion.scale().sigma > 0.2 * fusion.scale().value
+        assert uncertain == (piece > 0) and (fusion.submap is None) == (piece == 0)
+        flown.fly_on(flown.fusion.flight.memory.last.stamp_s + 0.5, leap, size=1.5 if piece == 2 else 1.0)
+        assert fusion.flight.trust.turns and fusion.flight.trust.velocity
+        off = fusion.orientation.R_w_m @ (T_m_w if leap is None else leap @ T_m_w)[:3, :3]
+        assert np.linalg.norm(rotation_vector(off)) < 0.05
+    assert fusion.scale().value == pytest.approx(before.value, rel=0.01)
+
+
+def test_pieces_that_were_merged_are_of_the_maps_unit(flown):
+    flown.fusion.begin_piece(*predicted_at(flown, 15.1))
+    flown.fly_on(16.0)
+    flown.fusion.begin_piece(2, *predicted_at(flown, 16.0)[1:])
+    flown.fly_on(16.5)
+    flown.fusion.join(lambda piece: min(piece, 1))
+    assert flown.fusion.submaps.keys() == {1}, "neither was measured"
+    flown.fusion.join(lambda piece: 0)
+    assert not flown.fusion.submaps and flown.fusion.submap is None
+    assert len(flown.fusion.flight.memory.newest().stamps_s) == len(flown.fusion.flight.memory.sightings().stamps_s)
 
 
 def test_a_scale_that_one_fit_did_not_determine_is_looked_for_again_soon(flown, monkeypatch):
@@ -193,8 +224,8 @@ def test_a_piece_that_begins_in_a_new_one_is_of_the_same_map(flown):
     before = flown.fusion.metres.sensor_scale
     flown.fusion.begin_piece(*predicted_at(flown, 15.1))
     flown.fly_on(16.0, size=3.0)
-    flown.fusion.begin_piece(*predicted_at(flown, 16.0))
-    assert (flown.fusion.submap.before, flown.fusion.submap.since_s) == (before, 16.0)
+    flown.fusion.begin_piece(2, *predicted_at(flown, 16.0)[1:])
+    assert flown.fusion.submap.before == before and flown.fusion.submap.measured is None
 
 
 def test_a_new_piece_of_map_is_no_motion(flown):

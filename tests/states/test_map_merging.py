@@ -30,6 +30,9 @@ class Pieces:
     def present(self):
         return self.piece
 
+    def whole(self, piece):
+        return min(piece, self.piece)
+
     def pose_of(self, keyframe_id):
         assert keyframe_id == KEYFRAME
         return self.T_k_w
@@ -56,14 +59,18 @@ class Pieces:
 
 
 def system_of(pieces, motion, busy=False):
-    log = SimpleNamespace(records=[SimpleNamespace(keyframe_id=KEYFRAME)], poses=lambda: ("stamps", "poses"))
+    log = SimpleNamespace(
+        records=[SimpleNamespace(keyframe_id=KEYFRAME)],
+        poses=lambda: ("stamps", "poses"),
+        support=lambda: SimpleNamespace(largest=lambda: pieces.piece),
+    )
     revised = []
     remembered = []
     fusion = SimpleNamespace(
         submap=None,
-        is_apart=False,
-        joined=[],
-        join=lambda returned=False: fusion.joined.append(returned),
+        submaps={},
+        enter=lambda piece: None,
+        join=lambda whole: None,
         revise=lambda *poses: revised.append(poses),
         revised=revised,
         scale=lambda: ScaleEstimate(2.0, 0.02, "telemetry"),
@@ -171,7 +178,7 @@ def scaling(rng, monkeypatch, piece, measured, sigma=0.03):
     atlas.is_up_to_date, atlas.edges = True, None
     before = ScaleBelief(0.3, 0.02, "telemetry")
     found = ScaleBelief(0.3 + np.log(measured), sigma, "height")
-    system.fusion.submap, system.fusion.is_apart = SubmapScale(0.0, before, found), True
+    system.fusion.submap = SubmapScale(before, found)
 
     def move(slam_map, edges, log, S):
         moved.append(S)
@@ -194,22 +201,20 @@ def test_a_submap_is_brought_to_the_maps_unit_about_its_beginning(rng, monkeypat
     np.testing.assert_allclose(sim3.transform(S[5], began[None])[0], began, atol=1e-12)
     np.testing.assert_allclose(after, 0.5 * before, atol=1e-9)
     assert system.published.revision == 1 and system.events == {"scaled": 1}
-    assert system.fusion.submap is not None, "its unit is known less well than the map's"
-    assert system.fusion.submap.growth == pytest.approx(1.0), "it grows once"
+    assert system.fusion.submaps[1].growth == pytest.approx(1.0), "it grows once"
 
 
 def test_a_submap_measured_as_well_as_the_map_is_of_one_unit_with_it(rng, monkeypatch):
     system, moved, _, _ = scaling(rng, monkeypatch, 1, measured=0.99, sigma=0.02)
-    assert len(moved) == 1 and system.fusion.submap is None
+    assert len(moved) == 1 and not system.fusion.submaps
 
 
 @pytest.mark.parametrize(
-    ("piece", "measured", "sigma", "returned"),
-    [(1, 0.97, 0.03, False), (1, 0.5, 0.2, False), (0, 0.5, 0.03, True)],
-    ids=["of the map's unit", "not yet known", "back in the first submap"],
+    ("piece", "measured", "sigma"),
+    [(1, 0.97, 0.03), (1, 0.5, 0.2), (0, 0.5, 0.03)],
+    ids=["of the map's unit", "not yet known", "the first submap"],
 )
-def test_other_submaps_stay(rng, monkeypatch, piece, measured, sigma, returned):
-    system, moved, _, (before, after) = scaling(rng, monkeypatch, piece, measured, sigma)
+def test_other_submaps_stay(rng, monkeypatch, piece, measured, sigma):
+    _, moved, _, (before, after) = scaling(rng, monkeypatch, piece, measured, sigma)
     np.testing.assert_array_equal(before, after)
-    assert not moved and system.fusion.submap is not None
-    assert system.fusion.joined == ([True] if returned else [])
+    assert not moved

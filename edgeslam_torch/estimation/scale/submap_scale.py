@@ -14,8 +14,6 @@ _SURE = 0.1
 class SubmapScale:
     """What sensors have measured since a submap began."""
 
-    since_s: float
-    """Stamp of its first frame."""
     before: ScaleBelief
     """Metres per map unit when it began."""
     measured: ScaleBelief | None = None
@@ -42,9 +40,9 @@ class SubmapScale:
 
         Example:
             >>> before = ScaleBelief(0.0, 0.02, "telemetry")
-            >>> SubmapScale(0.0, before, ScaleBelief(math.log(0.5), 0.05, "height")).growth
+            >>> SubmapScale(before, ScaleBelief(math.log(0.5), 0.05, "height")).growth
             0.5
-            >>> SubmapScale(0.0, before, ScaleBelief(math.log(0.95), 0.05, "height")).growth
+            >>> SubmapScale(before, ScaleBelief(math.log(0.95), 0.05, "height")).growth
             1.0
         """
         if self.measured is None or not self.is_known:

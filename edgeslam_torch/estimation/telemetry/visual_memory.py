@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -28,6 +28,8 @@ class VisualPose:
     sigma_t: float
     """Standard deviation of the translation per axis [map units]."""
     sigma_r_rad: float
+    piece: int = 0
+    """Number of its submap."""
 
     def moved(self, T: FloatArray) -> "VisualPose":
         """The pose in a map transformed by ``T`` ``(4, 4)``."""
@@ -122,8 +124,10 @@ class VisualMemory:
         self._interrupted = True
         self.began_s = math.inf
         """Stamp of the first tracked frame."""
-        self.apart_s = -math.inf
-        """Stamp from which on poses are of a submap that is not joined to the map before it."""
+        self.piece = 0
+        """Number of the camera's submap."""
+        self.R_w_piece: dict[int, FloatArray] = {}
+        """``(3, 3)`` axes of submaps to the drone's world, by their numbers: each begins at a predicted heading."""
         self.last: VisualPose | None = None
         """Newest tracked frame."""
         self.previous: VisualPose | None = None
@@ -144,26 +148,31 @@ class VisualMemory:
             self._interrupted = False
             self._shown = self._displacements = None
 
-    def since(self, stamp_s: float) -> "VisualMemory":
-        """A copy with the frames since a stamp alone."""
-        other, kept = copy(self), [k for k, v in enumerate(self._sightings) if v.stamp_s >= stamp_s]
+    def of(self, pieces: Collection[int]) -> "VisualMemory":
+        """A copy with the frames of some submaps alone."""
+        other, kept = copy(self), [k for k, v in enumerate(self._sightings) if v.piece in pieces]
         other._sightings = deque((self._sightings[k] for k in kept), self._sightings.maxlen)
-        other._unbroken = deque((self._unbroken[k] and k > kept[0] for k in kept), self._unbroken.maxlen)
+        other._unbroken = deque((self._unbroken[k] for k in kept), self._unbroken.maxlen)
         other._shown = other._displacements = None
         return other
 
-    def part(self, stamp_s: float) -> None:
-        """Poses from a stamp on are those of a submap whose heading in the map is unknown until both are joined."""
-        self.apart_s = stamp_s
+    @property
+    def pieces(self) -> set[int]:
+        """Numbers of the submaps of the stored poses, and of the camera's."""
+        return {v.piece for v in self._sightings} | {self.piece}
 
-    def join(self, returned: bool = False) -> None:
-        """All poses are of one map again; those of a submap that was left to return to the map before it are not."""
-        if returned:
-            kept = [(v, u) for v, u in zip(self._sightings, self._unbroken, strict=True) if v.stamp_s < self.apart_s]
-            self._sightings = deque((v for v, _ in kept), self._sightings.maxlen)
-            self._unbroken = deque((u for _, u in kept), self._unbroken.maxlen)
-            self._interrupted, self._shown, self._displacements = True, None, None
-        self.apart_s = -math.inf
+    def enter(self, piece: int) -> None:
+        """The camera is in a submap from now on."""
+        if piece != self.piece:
+            self.piece = piece
+            self.interrupt()
+            self._shown = self._displacements = None
+
+    def join(self, piece_of: Callable[[int], int]) -> None:
+        """Submaps were merged: ``piece_of`` returns the present number of each."""
+        self._sightings = deque((replace(v, piece=piece_of(v.piece)) for v in self._sightings), self._sightings.maxlen)
+        self.piece = piece_of(self.piece)
+        self._shown = self._displacements = None
 
     def interrupt(self) -> None:
         """End the current displacement: tracking was lost."""
@@ -210,18 +219,19 @@ class VisualMemory:
 
     def newest(self, count: int | None = None) -> Sightings:
         """The newest poses of the present submap in order, at most ``count``, as arrays."""
-        return _arrays([v for v in islice(reversed(self._sightings), count) if v.stamp_s >= self.apart_s][::-1])
+        return self._arrays([v for v in islice(reversed(self._sightings), count) if v.piece == self.piece][::-1])
 
     def sightings(self) -> Sightings:
-        """All poses as arrays."""
+        """All poses as arrays, in the axes of the camera's submap where those of theirs are known."""
         if self._shown is None:
-            self._shown = _arrays(self._sightings)
+            self._shown = self._arrays(self._sightings)
         return self._shown
 
-
-def _arrays(poses: Collection[VisualPose]) -> Sightings:
-    return Sightings(
-        np.array([v.stamp_s for v in poses]),
-        np.array([v.T for v in poses]).reshape(-1, 4, 4),
-        np.array([v.sigma_t for v in poses]),
-    )
+    def _arrays(self, poses: Collection[VisualPose]) -> Sightings:
+        T = np.array([v.T for v in poses]).reshape(-1, 4, 4)
+        piece, R_w_here = np.array([v.piece for v in poses]), self.R_w_piece.get(self.piece)
+        for other in set(piece.tolist()) & self.R_w_piece.keys() - {self.piece}:
+            if R_w_here is not None:
+                there = piece == other
+                T[there, :3] = R_w_here.T @ self.R_w_piece[other] @ T[there, :3]
+        return Sightings(np.array([v.stamp_s for v in poses]), T, np.array([v.sigma_t for v in poses]))
