@@ -23,6 +23,9 @@ from edgeslam_torch.types import FloatArray, ScaleEstimate
 
 DRIFT = 0.02
 """Standard deviation of the map's drift per axis, as a share of the path; monocular maps drift by 1 to 3 %."""
+YOUNG_DRIFT = 0.08
+"""The same in a map of a few seconds, whose parallax hardly tells a motion across the view from a turn: take-offs that
+rise straight are seen to lean by up to a fifth."""
 SENSOR_DRIFT = 0.01
 """The same where the drone's sensors measure metres; on repetitive wallpaper the gate must stay below one period after
 tens of metres."""
@@ -95,8 +98,8 @@ class SubmapGraph:
     """By the number of the submap."""
     _path: dict[int, float] = field(default_factory=dict)
     """Length of the shortest covisibility path [map units] from the first keyframe to others, by their ids."""
-    drift: float = 0.0
-    """Standard deviation per axis [map units] of the newest keyframe's drift since the first one."""
+    path: float = 0.0
+    """That of the newest keyframe, along which the map has drifted."""
 
     def begin(self, piece: int, keyframe: Keyframe, sigma_t: float, sigma_r_rad: float, one_unit: bool = False) -> None:
         """Add a submap that begins at a keyframe in the map, at a pose predicted with standard deviations per axis
@@ -114,11 +117,11 @@ class SubmapGraph:
         return self.map.piece_of(self.log.records[0].keyframe_id)
 
     def add(self, keyframe: Keyframe) -> None:
-        """Update the drift with a mapped keyframe: a revisit makes its path short again."""
+        """Update the path with a mapped keyframe: a revisit makes it short again."""
         near = [k for k in self.map.covisible(keyframe, NEIGHBOURS) if k.id in self._path]
         paths = [self._path[k.id] + float(np.linalg.norm(k.centre_w - keyframe.centre_w)) for k in near]
-        self._path[keyframe.id] = min(paths, default=self.drift / DRIFT)
-        self.drift = DRIFT * self._path[keyframe.id]
+        self._path[keyframe.id] = min(paths, default=self.path)
+        self.path = self._path[keyframe.id]
 
     # -- marginals ---------------------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from edgeslam_torch.atlas.submap_graph import SubmapGraph
+from edgeslam_torch.atlas.submap_graph import DRIFT, YOUNG_DRIFT, SubmapGraph
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.estimation.displacement import TelemetryModel
 from edgeslam_torch.estimation.motion import MotionFusion
@@ -140,7 +140,9 @@ class System:
         if not self.log.records:
             return 0.0, 0.0
         sigma_t, _ = self.graph.uncertainty(piece, self.graph.first, se3.inverse(self.motion.T_c_w)[:3, 3])
-        return self.published.scale * sigma_t, self.published.scale * self.graph.drift
+        is_young = self.motion.stamp_s - self.log.records[0].stamp_s < NEW_MAP_S
+        drift = (YOUNG_DRIFT if is_young else DRIFT) * self.graph.path
+        return self.published.scale * sigma_t, self.published.scale * drift
 
     def add_earlier(self, since_s: float, track: Track) -> None:
         """Pass logged frames since a stamp to the fusion once a map supports them, and publish the resulting scale;

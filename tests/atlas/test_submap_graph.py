@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgeslam_torch.atlas.submap_graph import DRIFT, Belief, SubmapGraph
+from edgeslam_torch.atlas.submap_graph import Belief, SubmapGraph
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.types import ScaleEstimate
 
@@ -99,7 +99,7 @@ def test_the_first_submap_of_a_flight_has_no_uncertainty():
 
 def drifts(world):
     graph = world.graph()
-    return [(graph.add(k), graph.drift / DRIFT)[1] for k in world.keyframes]
+    return [(graph.add(k), graph.path)[1] for k in world.keyframes]
 
 
 def test_drift_grows_along_the_path_and_a_revisit_shortens_it():

@@ -5,7 +5,7 @@ import pytest
 
 from edgeslam_torch.drone.emulator.lockstep import LockstepTello
 from edgeslam_torch.drone.emulator.room import drone_at
-from edgeslam_torch.eval.judge.navigation.flight import TICK_S
+from edgeslam_torch.eval.judge.navigation.flight import TICK_S, is_beyond
 from edgeslam_torch.eval.judge.navigation.perception import FAULTS, IMAGE_SIZE, SlamPerception
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.navigation.map_views import MapViews, Places
@@ -31,6 +31,13 @@ def test_a_climb_before_bare_walls_is_not_taken_for_a_turn():
     way = np.array([state.p_w for state in states if state.stamp_s > 5.0])
     assert np.ptp(way[:, 2]) > 0.1, "it does go up and down"
     assert np.abs(way[:, :2]).max() < 0.15 and states[-1].tracked
+
+
+@pytest.mark.slow
+def test_a_climb_that_is_seen_to_lean_says_how_far_it_may():
+    """The first baseline is a few centimetres: the images explain the climb by a turn, 0.2 m aside."""
+    metric = [(state, p_w) for state, p_w in told("cluttered_room", 8.0, seed=904) if state.metric]
+    assert len(metric) > 20 and not any(is_beyond(state, p_w) for state, p_w in metric)
 
 
 @pytest.mark.slow
