@@ -337,9 +337,9 @@ class EdgeSlam:
             system.published = system.published.levelled(up.direction)
         self.up = replace(up, direction=system.published.R @ up.direction)
 
-    def trajectory(self) -> tuple[FloatArray, FloatArray]:
-        """Stamps ``(F,)`` and refined ``T_w_c`` ``(F, 4, 4)`` of all frames so far."""
-        stamps, T_w_c = self.log.poses()
+    def trajectory(self, count: int | None = None) -> tuple[FloatArray, FloatArray]:
+        """Stamps ``(F,)`` and refined ``T_w_c`` ``(F, 4, 4)`` of all frames so far, or of the first ``count``."""
+        stamps, T_w_c = self.log.poses(count=count)
         return stamps, self._system.published.pose(T_w_c)
 
     def close(self) -> None:

@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import matrices_from_vectors, vectors_from_matrices
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.types import FloatArray, Piece, Support
 
 _THE_SAME = 1e-9
+_STEP = 1e-9
+"""Least way from one frame to the next [map units]: a change is distributed evenly over frames without motion."""
 
 
 @dataclass(slots=True)
@@ -123,10 +126,11 @@ class TrajectoryLog:
         spans = ", ".join(f"{p.number} ({p.first_s - began_s:.1f} to {p.last_s - began_s:.1f} s)" for p in pieces)
         return f"the map is in {len(pieces)} pieces that were never joined, {spans}: poses across them do not relate"
 
-    def poses(self, since_s: float = -math.inf) -> tuple[FloatArray, FloatArray]:
-        """Stamps ``(F,)`` and ``T_w_c`` ``(F, 4, 4)`` in the map as it is now, of frames not older than ``since_s``."""
+    def poses(self, since_s: float = -math.inf, count: int | None = None) -> tuple[FloatArray, FloatArray]:
+        """Stamps ``(F,)`` and ``T_w_c`` ``(F, 4, 4)`` in the map as it is now, of frames not older than ``since_s``, at
+        most the first ``count``."""
         first = bisect.bisect_left(self.records, since_s, key=lambda r: r.stamp_s)
-        records = self.records[first:]
+        records = self.records[first:][:count]
         if not records:
             return np.zeros(0), np.zeros((0, 4, 4))
         with self.map.lock:
@@ -140,7 +144,7 @@ class TrajectoryLog:
 def _close_gaps(
     records: list[FrameRecord], T_c_w: FloatArray, T_k_w: dict[int, FloatArray], own: NDArray[np.bool_]
 ) -> None:
-    """Distribute a refinement's change between two keyframes over the frames in between, in place.
+    """Distribute a refinement's change between two keyframes over the frames in between by the way, in place.
 
     A frame keeps its tracked pose relative to its keyframe. After a refinement of the next keyframe, the error of
     frames would grow towards it, with a jump at it.
@@ -151,24 +155,28 @@ def _close_gaps(
         T_k_w: World-to-camera pose of each keyframe.
         own: Whether a frame is the reference keyframe itself ``(F,)``; the first ones of a map were not tracked before.
     """
-    begin = 0
+    begin, gaps, before = 0, [], []
     for i, record in enumerate(records):
         if record.T_c_before is None:
             begin = i if own[i] else begin
             continue
         observed = records[begin].keyframe_id  # frames tied to another one need not be right where that one begins
         if i - begin > 1 and all(r.supported and r.keyframe_id == observed for r in records[begin:i]):
-            tracked = record.T_c_before @ T_k_w[records[i - 1].keyframe_id]
-            moved = se3.log(T_c_w[i] @ se3.inverse(tracked))
-            way = _way(np.concatenate([T_c_w[begin:i], tracked[None]]))
-            for k in range(begin + 1, i):
-                T_c_w[k] = se3.exp(way[k - begin] / way[-1] * moved) @ T_c_w[k]
+            gaps.append((begin, i))
+            before.append(record.T_c_before @ T_k_w[records[i - 1].keyframe_id])
         begin = i
-
-
-def _way(T_c_w: FloatArray) -> FloatArray:
-    """Path length up to each of some poses ``(F,)``; equal steps without motion."""
-    steps = np.linalg.norm(np.diff(se3.inverse(T_c_w)[:, :3, 3], axis=0), axis=1)
-    if not steps.any():
-        steps = np.ones_like(steps)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    if not gaps:
+        return
+    (first, end), tracked = np.array(gaps).T, np.stack(before)
+    centre, last = (se3.inverse(T)[:, :3, 3] for T in (T_c_w, tracked))
+    step = np.linalg.norm(np.diff(centre, axis=0, prepend=centre[:1]), axis=1) + _STEP
+    so_far = np.cumsum(step)
+    whole = so_far[end - 1] - so_far[first] + np.linalg.norm(last - centre[end - 1], axis=1) + _STEP
+    gap = np.repeat(np.arange(len(gaps)), end - first - 1)
+    frame = np.concatenate([np.arange(i + 1, j) for i, j in gaps])
+    share = ((so_far[frame] - so_far[first[gap]]) / whole[gap])[:, None]
+    moved = T_c_w[end] @ se3.inverse(tracked)
+    change = np.tile(np.eye(4), (len(frame), 1, 1))
+    change[:, :3, :3] = matrices_from_vectors(share * vectors_from_matrices(moved[:, :3, :3])[gap])
+    change[:, :3, 3] = share * moved[gap, :3, 3]
+    T_c_w[frame] = change @ T_c_w[frame]

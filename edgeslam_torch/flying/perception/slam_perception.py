@@ -107,10 +107,10 @@ class SlamPerception:
         with self._lock:
             batch = list(self._samples)
         output = self._slam.step(Frame(self._frames, arrived_s, image), batch)
-        T_slam = self._slam.trajectory()[1]
         self._frames += 1
         revised, self._revision = output.revision != self._revision, output.revision
         shows = revised or self._frames % _DEPTH_EVERY == 0
+        T_slam = self._slam.trajectory(None if shows else 1)[1]
         depth = self._depth(image, output) if shows else None
         # A new scale is only sent together with a view at that scale.
         late = captured_s - self._moved_s > _MOVES_EVERY_S
