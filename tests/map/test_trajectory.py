@@ -4,6 +4,7 @@ import numpy as np
 from point_map import filled, small_motion
 
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import vectors_from_matrices
 from edgeslam_torch.map.trajectory import TrajectoryLog
 
 
@@ -67,6 +68,22 @@ def test_frames_follow_the_next_keyframe_where_refinement_moved_it(rng):
     np.testing.assert_allclose(log.poses()[1][:, 0, 3], [0.0, 0.1, 0.2, 0.3, 0.4, 0.5], atol=1e-12)
     log.records[2].supported = False  # a predicted frame between them, without a measured pose
     np.testing.assert_allclose(log.poses()[1][:, 0, 3], [0.0, 0.2, 0.4, 0.6, 0.4, 0.5], atol=1e-12)
+
+
+def test_a_turn_of_the_next_keyframe_is_distributed_as_well(rng):
+    points = filled(rng, 200, 2)
+    a, b = points.keyframes
+    a.T_c_w = np.eye(4)
+
+    log = TrajectoryLog(points.map)
+    for i, x in enumerate((0.0, 0.2, 0.4, 0.6)):
+        log.append(i, 0.1 * i, a.id, forward(x), True, None if i else np.eye(4))
+    before = log.relative_to_last(forward(0.8))
+    b.T_c_w = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.2])) @ forward(0.8)
+    log.append(4, 0.4, b.id, b.T_c_w, True, before)
+    turned = vectors_from_matrices(se3.inverse(log.poses()[1])[:, :3, :3])
+    np.testing.assert_allclose(turned, np.outer([0.0, 0.05, 0.1, 0.15, 0.2], [0.0, 0.0, 1.0]), atol=1e-8)
+    assert len(log.poses(count=2)[0]) == 2
 
 
 def test_frames_of_the_first_map_are_corrected_too(rng):
