@@ -168,8 +168,8 @@ class MotionFusion:
         self._fit_imu(whole=True)
 
     def _fit_imu(self, whole: bool = False) -> None:
-        """Align the IMU with the stored poses."""
-        shown = self._memory.sightings()
+        """Align the IMU with the poses of the camera's submap."""
+        shown = self._memory.newest()
         self.imu.fit(shown.stamps_s, shown.T, whole)
         self.metres.inertial = self.imu.scale
 
@@ -203,6 +203,11 @@ class MotionFusion:
             self.submaps[piece] = SubmapScale(before)
 
     @property
+    def piece(self) -> int:
+        """Number of the camera's submap."""
+        return self._memory.piece
+
+    @property
     def submap(self) -> SubmapScale | None:
         """Scale of the camera's submap, if it is not the map's."""
         return self.submaps.get(self._memory.piece)
@@ -212,7 +217,7 @@ class MotionFusion:
         if piece != self._memory.piece:
             self._filter.clear()
             if self._memory.last is not None:
-                self.imu.begin_submap(self._memory.last.stamp_s)
+                self.imu.enter_submap(self._memory.last.stamp_s)
             self._memory.enter(piece)
             self._fitted_s = -math.inf
 

@@ -165,6 +165,26 @@ def test_the_pose_between_frames_turns_with_the_gyroscope() -> None:
     assert off[0] < min(0.005, 0.2 * off[1])
 
 
+def test_a_piece_of_map_is_aligned_by_its_own_poses() -> None:
+    """The camera leaves it for another one of another unit and heading, and returns at the end."""
+    model = mounted(ADIS16448, T_IMU_CAM)
+    seen = flight("free", model, 0)
+    fusion = MotionFusion(FusionConfig(), np.eye(4), imu=model)
+    fusion.add_imu([seen.readings])
+    left_s, returned_s = seen.stamps_s[0] + 0.7 * np.ptp(seen.stamps_s), seen.stamps_s[-3]
+    other = np.eye(4)
+    other[:3, :3] = Rotation.from_rotvec([0.0, 0.5, 0.4]).as_matrix()
+    for stamp_s, T in zip(seen.stamps_s.tolist(), seen.T_m_c, strict=True):
+        away = left_s < stamp_s < returned_s
+        fusion.enter(int(away))
+        T_own = other @ T if away else T.copy()
+        T_own[:3, 3] *= 3.0 if away else 1.0
+        fusion.add_visual(stamp_s, T_own, 0.01, 0.001)
+    fusion.revise(np.zeros(0), np.zeros((0, 4, 4)))
+    assert fusion.scale().source == "imu"
+    assert fusion.scale().value == pytest.approx(SCALE, rel=0.03)
+
+
 FAULTS = {
     "rates, axes": lambda rate, felt, other: (rate[:, [1, 0, 2]], felt),
     "rates, degrees": lambda rate, felt, other: (np.rad2deg(rate), felt),

@@ -72,8 +72,8 @@ class Imu:
         self.forces = self.forces + [part for part in parts if not part.has_gyroscope]
         self._parts += [part for part in parts if len(part) and part.has_gyroscope]
 
-    def begin_submap(self, stamp_s: float) -> None:
-        """Poses up to a stamp belong to another submap."""
+    def enter_submap(self, stamp_s: float) -> None:
+        """From a stamp on the camera is in another submap, of whose poses alone later fits are."""
         self._since_s, self.alignment = stamp_s, None
 
     def is_due(self, stamp_s: float) -> bool:
@@ -89,7 +89,7 @@ class Imu:
 
         Args:
             stamps_s: Increasing stamps ``(N,)`` at 10 Hz.
-            T_m_c: Poses ``(N, 4, 4)`` in the present map.
+            T_m_c: Poses ``(N, 4, 4)`` in the camera's submap.
             whole: Of the whole flight, instead of the last seconds.
         """
         if not self._parts or len(stamps_s) == 0:
@@ -97,8 +97,7 @@ class Imu:
         self._fitted_s = float(stamps_s[-1])
         reach_s = math.inf if whole else REACH_S
         margin_s = _OFFSET_RANGE_S if self._mount is None else abs(self._mount[1])
-        first_s = max(self._since_s, stamps_s[-1] - reach_s, self._parts[0].stamps_s[0] + margin_s)
-        began_s = max(self._since_s, float(stamps_s[0]))
+        first_s, began_s = max(stamps_s[-1] - reach_s, self._parts[0].stamps_s[0] + margin_s), float(stamps_s[0])
         if stamps_s[-1] - began_s > _MATURE_S:
             first_s = max(first_s, began_s + IMU_YOUNG_S)
         last_s = self._parts[-1].stamps_s[-1] - margin_s
