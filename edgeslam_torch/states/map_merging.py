@@ -26,8 +26,9 @@ class MapMerging:
         system, changes = self.system, []
         if system.mapping.busy or not system.log.records:
             return ""
-        if system.fusion.submap is not None:
-            self._scale_submap(system.fusion.submap)
+        piece = system.map.piece_of(system.log.records[-1].keyframe_id)
+        if piece in system.fusion.submaps:
+            self._scale_submap(piece, system.fusion.submaps[piece])
         while not self.atlas.is_up_to_date and (found := self._followed()):
             changes.append(found)
         return "; ".join(map(str, changes))
@@ -54,15 +55,18 @@ class MapMerging:
             self.atlas.search_all_again()
         self.update()
         largest = self.system.log.support().largest()
-        if largest is not None:  # the result
+        if largest is None:
+            return
+        self.system.fusion.submaps.pop(largest, None)
+        if largest != self.system.fusion.piece:  # its heading and metres are the result's
             self.system.fusion.enter(largest)
-            self.system.fusion.submaps.pop(largest, None)
+            self.system.fusion.revise(*self.system.log.poses())
 
-    def _scale_submap(self, known: SubmapScale) -> None:
-        """Bring the camera's submap to the map's unit, about the place where it began, whenever sensors contradict that
-        it is: a change of the unit instead would move that place, where the map before it had the camera."""
+    def _scale_submap(self, piece: int, known: SubmapScale) -> None:
+        """Bring the newest frame's submap to the map's unit, about the place where it began, whenever sensors
+        contradict that it is: a change of the unit instead would move that place, where the map before it had the
+        camera."""
         system, last, growth = self.system, self.system.log.records[-1].keyframe_id, known.growth
-        piece = system.map.piece_of(last)
         start = self.atlas.graph.starts.get(piece)
         if start is None:
             return

@@ -33,6 +33,9 @@ class Pieces:
     def whole(self, piece):
         return min(piece, self.piece)
 
+    def piece_of(self, keyframe_id):
+        return self.piece
+
     def pose_of(self, keyframe_id):
         assert keyframe_id == KEYFRAME
         return self.T_k_w
@@ -67,9 +70,10 @@ def system_of(pieces, motion, busy=False):
     revised = []
     remembered = []
     fusion = SimpleNamespace(
-        submap=None,
         submaps={},
-        enter=lambda piece: None,
+        piece=1,
+        entered=[],
+        enter=lambda piece: fusion.entered.append(piece),
         join=lambda whole: None,
         revise=lambda *poses: revised.append(poses),
         revised=revised,
@@ -174,11 +178,11 @@ def scaling(rng, monkeypatch, piece, measured, sigma=0.03):
     pieces.pose_of = lambda id: began if id == 5 else pieces.T_k_w
     system = system_of(pieces, motion)
     atlas = pieces.atlas(moved=1)
-    atlas.graph = SimpleNamespace(starts={1: SimpleNamespace(keyframe_id=5)})
+    atlas.graph = SimpleNamespace(starts={1: SimpleNamespace(keyframe_id=5), 2: SimpleNamespace(keyframe_id=KEYFRAME)})
     atlas.is_up_to_date, atlas.edges = True, None
     before = ScaleBelief(0.3, 0.02, "telemetry")
     found = ScaleBelief(0.3 + np.log(measured), sigma, "height")
-    system.fusion.submap = SubmapScale(before, found)
+    system.fusion.submaps[1] = SubmapScale(before, found)
 
     def move(slam_map, edges, log, S):
         moved.append(S)
@@ -211,10 +215,21 @@ def test_a_submap_measured_as_well_as_the_map_is_of_one_unit_with_it(rng, monkey
 
 @pytest.mark.parametrize(
     ("piece", "measured", "sigma"),
-    [(1, 0.97, 0.03), (1, 0.5, 0.2), (0, 0.5, 0.03)],
-    ids=["of the map's unit", "not yet known", "the first submap"],
+    [(1, 0.97, 0.03), (1, 0.5, 0.2), (0, 0.5, 0.03), (2, 0.5, 0.03)],
+    ids=["of the map's unit", "not yet known", "the first submap", "another submap"],
 )
 def test_other_submaps_stay(rng, monkeypatch, piece, measured, sigma):
-    _, moved, _, (before, after) = scaling(rng, monkeypatch, piece, measured, sigma)
+    system, moved, _, (before, after) = scaling(rng, monkeypatch, piece, measured, sigma)
     np.testing.assert_array_equal(before, after)
-    assert not moved
+    assert not moved and set(system.fusion.submaps) == {1}
+
+
+def test_the_result_is_the_largest_submap_wherever_the_camera_is(rng):
+    """Its heading and scale are looked for again."""
+    T_k_w, motion = moving(rng)
+    system = system_of(Pieces(T_k_w), motion)
+    atlas = system.map.atlas(moved=1)
+    atlas.is_divided, atlas.is_up_to_date, system.map.piece_of = False, True, lambda id: 0
+    system.log.support = lambda: SimpleNamespace(largest=lambda: 0)
+    MapMerging(system, atlas).finish()
+    assert system.fusion.entered == [0] and system.fusion.revised == [("stamps", "poses")]
