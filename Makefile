@@ -31,7 +31,7 @@ $(STAMP): pyproject.toml constraints.txt
 		{ echo "make: $(PYTHON) is older than Python 3.11; say make PYTHON=/path/to/python3.11"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --no-compile $(PIP_ARGS) -c constraints.txt -e '.[dev]'
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m compileall -q edgeslam_torch $(addprefix $(VENV)/lib/python*/site-packages/,$(LOADED))
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m compileall -q edgeslam_torch $(addprefix $(VENV)/lib/python*/site-packages/,$(LOADED)) || true
 	@touch $@
 
 demo: $(STAMP)
