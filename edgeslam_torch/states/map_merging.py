@@ -55,12 +55,12 @@ class MapMerging:
             self.atlas.search_all_again()
         self.update()
         largest = self.system.log.support().largest()
-        if largest is None:
-            return
-        self.system.fusion.submaps.pop(largest, None)
-        if largest != self.system.fusion.piece:  # its heading and metres are the result's
-            self.system.fusion.enter(largest)
-            self.system.fusion.revise(*self.system.log.poses())
+        fusion = self.system.fusion
+        if largest is not None and largest != fusion.piece:  # its heading and metres are the result's
+            fusion.enter(largest)
+            fusion.revise(*self.system.log.poses())
+        if largest in fusion.submaps and fusion.submaps[largest].is_known:
+            del fusion.submaps[largest]
 
     def _scale_submap(self, piece: int, known: SubmapScale) -> None:
         """Bring the newest frame's submap to the map's unit, about the place where it began, whenever sensors

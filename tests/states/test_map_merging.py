@@ -224,12 +224,16 @@ def test_other_submaps_stay(rng, monkeypatch, piece, measured, sigma):
     assert not moved and set(system.fusion.submaps) == {1}
 
 
-def test_the_result_is_the_largest_submap_wherever_the_camera_is(rng):
-    """Its heading and scale are looked for again."""
+@pytest.mark.parametrize("sigma", [0.03, 0.3])
+def test_the_result_is_the_largest_submap_wherever_the_camera_is(rng, sigma):
+    """Its heading and scale are looked for again; one that was never measured stays uncertain."""
     T_k_w, motion = moving(rng)
     system = system_of(Pieces(T_k_w), motion)
     atlas = system.map.atlas(moved=1)
     atlas.is_divided, atlas.is_up_to_date, system.map.piece_of = False, True, lambda id: 0
     system.log.support = lambda: SimpleNamespace(largest=lambda: 0)
+    atlas.graph = SimpleNamespace(starts={})
+    system.fusion.submaps[0] = SubmapScale(ScaleBelief(0.3, 0.02, "telemetry"), ScaleBelief(0.3, sigma, "height"))
     MapMerging(system, atlas).finish()
+    assert (0 in system.fusion.submaps) == (sigma > 0.1)
     assert system.fusion.entered == [0] and system.fusion.revised == [("stamps", "poses")]
